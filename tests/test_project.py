@@ -134,11 +134,11 @@ def test_every_make_target_that_a_page_names_exists(page):
 def test_a_process_loads_nothing_that_it_does_not_use_until_it_connects(words, unused, tmp_path):
     code = (
         f"import sys; sys.argv = ['teamslam', *{words.split()!r}]\n"
-        "from teamslam.sim.cli import main, nodes\n"
+        "from teamslam.sim.cli import main, options\n"
         "def connect_bus(*_):\n"
         "    import teamslam.team.wire.zenoh.bus\n"
         "    sys.exit()\n"
-        "nodes.connect_bus = connect_bus\n"
+        "options.connect_bus = connect_bus\n"
         "try: main.main()\n"
         "finally: print(*(name for name, module in sys.modules.items() if module))"
     )

@@ -1,14 +1,18 @@
-"""Declare commands by the signatures of functions; help texts in sections, an example each."""
+"""Commands declared by the signatures of functions: parameters, help in sections, errors."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType, UnionType
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
+from typing import Any, Literal, NamedTuple, NoReturn, TypeVar, get_args, get_origin
 
 import click
+from click.exceptions import Exit
+
+from teamslam.team.wire.text import printable_lines
 
 ARGUMENTS = "Arguments"
 OPTIONS = "Options"
@@ -21,6 +25,10 @@ PLACEHOLDERS: Mapping[object, str] = MappingProxyType(
     {str: "TEXT", int: "N", float: "X", Path: "PATH"}
 )
 """Placeholder of an option's value by its type, if the option has none."""
+WRONG_USE = 2
+FAILED = 1
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, by the shell's convention."""
 F = TypeVar("F", bound=Callable[..., None])
 
 
@@ -183,3 +191,31 @@ def _type_of(kind: Any, described: Parameter) -> Any:
         return click.FloatRange(least, most)
     low, high = (None if each is None else int(each) for each in (least, most))
     return click.IntRange(low, high)
+
+
+def fail(message: str, status: int = FAILED) -> NoReturn:
+    """Print an error and exit with this status."""
+    print_error(message)
+    raise Exit(status)
+
+
+def refuse(message: str) -> NoReturn:
+    """Print an error about the use of a command, and exit with 2."""
+    fail(message, WRONG_USE)
+
+
+def print_error(message: str) -> None:
+    """Print an error on stderr."""
+    click.secho(f"error: {printable_lines(message)}", fg="red", err=True)
+
+
+@contextmanager
+def failing(*errors: type[Exception], at: object = "", status: int = FAILED) -> Iterator[None]:
+    """Exit with this status and the text of such an error, after the text of `at`."""
+    try:
+        yield
+    except errors as error:
+        fail(f"{at}: {error}" if at else str(error), status)
+
+
+refusing = partial(failing, status=WRONG_USE)

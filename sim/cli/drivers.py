@@ -7,17 +7,16 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from teamslam.sim.cli.commands import Group, argument, network, option, rare
-from teamslam.sim.cli.options import (
-    FAILED,
-    LOOPBACK,
-    WRONG_USE,
-    Connect,
-    Keys,
-    fail,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
+    Group,
+    argument,
     failing,
-    over_tls,
-    parse_start,
+    network,
+    option,
+    rare,
+    refuse,
+    refusing,
 )
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def driver(
     robot: Annotated[str, argument("The robot's name, as r1.")],
     ros2: Annotated[Path, option("TOML file that assigns topics.", "FILE")],
     team: Annotated[str, option("The team's name: its scenario's.", "NAME")],
-    connect: Connect = LOOPBACK,
+    connect: opt.Connect = opt.LOOPBACK,
     ros2_connect: Annotated[
         str | None,
         network(
@@ -55,7 +54,7 @@ def driver(
             "ENDPOINT",
         ),
     ] = None,
-    keys: Keys = None,
+    keys: opt.Keys = None,
     file: Annotated[
         Path | None, rare("Where all measurements are kept; default: ROBOT.stream here.", "FILE")
     ] = None,
@@ -94,23 +93,23 @@ def driver(
     logging.captureWarnings(True)
     # A detector lists its tags in any order; measurements stay with their names.
     warnings.filterwarnings("ignore", message=".*ids are not ascending", category=DriverWarning)
-    with failing(WRONG_USE, TopicsError):
+    with refusing(TopicsError):
         topics = load_topics(ros2)
     if robot not in topics.robots:
-        fail(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}", WRONG_USE)
+        refuse(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}")
     live = None
     if answers is not Back.NONE:
         live = LiveAnswers(robot, topics.robots[robot], has_tf=answers is Back.ALL)
-    pose = () if start is None else parse_start(start)[1]
+    pose = () if start is None else opt.parse_start(start)[1]
     variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
     with (
-        failing(WRONG_USE, MeasurementError, at="--start"),
-        failing(FAILED, DriverError),
+        refusing(MeasurementError, at="--start"),
+        failing(DriverError),
         process(f"driver-{robot}", endless=True, patient=True) as stop,
         Driver(
             robot,
             team=team,
-            connect=connect if keys is None else over_tls(connect),
+            connect=connect if keys is None else opt.over_tls(connect),
             keys=keys,
             file=file,
             start=pose[:3] or None,
@@ -141,7 +140,7 @@ def driver(
                 source.tell(translated.figures(), translated.warnings())
                 translated.report()
                 if translated.refusal:
-                    fail(f"{ros2}: {translated.refusal}", WRONG_USE)
+                    refuse(f"{ros2}: {translated.refusal}")
             until = time.monotonic() + LAST_S
             while time.monotonic() < until:  # messages in transit; the topic may continue
                 for sample in foreign.receive(LAST_S):

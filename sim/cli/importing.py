@@ -11,17 +11,15 @@ from typing import Annotated
 import click
 from click.exceptions import Exit
 
-from teamslam.sim.cli.commands import Group, argument, option, output_option
-from teamslam.sim.cli.options import (
-    FAILED,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
     WRONG_USE,
-    JsonFile,
-    count_noun,
-    fail,
+    Group,
+    argument,
     failing,
-    parse_start,
-    set_aside,
-    write_json,
+    option,
+    output_option,
+    refuse,
 )
 from teamslam.team.extras import install_command
 
@@ -75,21 +73,20 @@ def import_(
         if text := proposal(source[0]):
             click.echo(text)
             return
-        fail("give the folder for the data set: -o FOLDER", WRONG_USE)
+        refuse("give the folder for the data set: -o FOLDER")
     if robot is not None and not re.fullmatch(ROBOT_NAME, robot):
-        fail(f"--robot {robot}: a small letter, then small letters, digits and _", WRONG_USE)
+        refuse(f"--robot {robot}: a small letter, then small letters, digits and _")
     adds = robot is not None and takes_robot(output, robot)
     if output.exists() and not adds and (not output.is_dir() or any(output.iterdir())):
-        fail(
+        refuse(
             f"{output} is not empty: give a new folder, or --robot with a new name to add a robot "
-            "to a data set",
-            WRONG_USE,
+            "to a data set"
         )
     began = time.monotonic()
     request = Request(
         sources=source,
         robot=robot,
-        starts=dict(map(parse_start, start or [])),
+        starts=dict(map(opt.parse_start, start or [])),
         columns=columns,
         ros2=ros2,
         truth=truth,
@@ -114,7 +111,7 @@ def import_(
         click.echo(note)
     if report.messages:
         rate = report.messages / elapsed_s
-        click.echo(f"{count_noun(report.messages, 'message')}, {rate:,.0f} a second")
+        click.echo(f"{opt.count_noun(report.messages, 'message')}, {rate:,.0f} a second")
     click.echo(f"wrote {output}: `teamslam launch --dataset {output}` runs the team on it")
 
 
@@ -123,7 +120,7 @@ def import_into(path: Path, folder: Path) -> Path:
     from teamslam.sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
-        fail(f"{folder} is not empty: give another --output", WRONG_USE)
+        refuse(f"{folder} is not empty: give another --output")
     for note in import_data(Request(sources=[path]), folder).notes:
         click.echo(note, err=True)
     click.echo(f"imported {path} into {folder}", err=True)
@@ -167,11 +164,11 @@ def _as_read(folder: Path) -> list[str]:
         lines.append(warning)
     for stream in streams.streams:
         seen, teammates = len(stream.landmark_detections.ids), len(stream.teammate_detections.ids)
-        driven = count_noun(len(stream.intervals.end_ns), "odometry interval")
+        driven = opt.count_noun(len(stream.intervals.end_ns), "odometry interval")
         pose = "known" if stream.start is not None else "not known"
         lines.append(
-            f"{stream.robot}: {driven}, {count_noun(seen, 'measurement')}, "
-            f"{count_noun(teammates, 'sighting')}, initial pose {pose}"
+            f"{stream.robot}: {driven}, {opt.count_noun(seen, 'measurement')}, "
+            f"{opt.count_noun(teammates, 'sighting')}, initial pose {pose}"
         )
         lines += [f"{stream.robot}: {note}" for note in stream.notes]
     return lines
@@ -192,7 +189,7 @@ def calibrate(
     scenario: Annotated[
         str | None, option("The scenario to begin with; default: the source's own.")
     ] = None,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Calibrate odometry and sensor models from measurements, each figure with its uncertainty.
 
@@ -202,14 +199,14 @@ def calibrate(
     from dataclasses import asdict, replace
 
     if find_spec("scipy") is None:
-        fail(f"calibrate needs SciPy: {install_command('calibrate')}", WRONG_USE)
+        refuse(f"calibrate needs SciPy: {install_command('calibrate')}")
     from rich.console import Console
     from rich.table import Table
 
     from teamslam.sim.calibration.calibrate import calibrate_models
     from teamslam.sim.calibration.figures import CalibrationError
     from teamslam.sim.calibration.scenario import scenario_text
-    from teamslam.sim.cli.options import scenario_of, warn_of_holes
+    from teamslam.sim.cli import options as opt
     from teamslam.sim.recorded.streams import measurements_in
     from teamslam.sim.scenarios.scenario import Scenario, builtin_names
     from teamslam.sim.scenarios.source import open_data_set, scenario_beside
@@ -217,7 +214,7 @@ def calibrate(
     from teamslam.team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
-        fail(f"--output {output}: a scenario's name ends in .toml", WRONG_USE)
+        refuse(f"--output {output}: a scenario's name ends in .toml")
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)  # fails before minutes of computation
     read: list[tuple[str, WorldStreams, Scenario]] = []
@@ -226,16 +223,16 @@ def calibrate(
         click.echo(f"reading {path}", err=True)
         with readable(path) as found_at:
             if found_at.suffix == ".mcap":
-                warn_of_holes(open_log(found_at))
+                opt.warn_of_holes(open_log(found_at))
                 read.append((path.name, *measurements_in(found_at)))
                 continue
             if not read and scenario is None:
                 own = scenario_beside(found_at)
             read.append((path.name, *open_data_set(found_at)[:2]))
     own = None if own in builtin_names() else own
-    start = read[0][2] if scenario is None else scenario_of(scenario)
+    start = read[0][2] if scenario is None else opt.scenario_of(scenario)
     worlds = [(name, world if truth else replace(world, landmarks=None)) for name, world, _ in read]
-    with failing(FAILED, CalibrationError):
+    with failing(CalibrationError):
         found = calibrate_models(worlds, start, lambda text: click.echo(text, err=True))
     table = Table("part", "figure", "value", "± (1 σ)", "unit")
     parts = (
@@ -253,11 +250,11 @@ def calibrate(
     Console().print(table)
     for note in found.notes:
         click.echo(note)
-    write_json(json_file, asdict(found))
+    opt.write_json(json_file, asdict(found))
     if output is not None:
         names = [name for name, _, _ in read]
         text = scenario_text(found, start, own, names, output)
         if output.exists():
-            set_aside(output)
+            opt.set_aside(output)
         output.write_text(text, "utf-8")
         click.echo(f"wrote {output}: `teamslam launch {output} --dataset …` uses it")

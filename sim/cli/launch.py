@@ -11,40 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from teamslam.central.desk.names import data_set_name
-from teamslam.sim.cli.commands import Group, argument, network, option, output_option, rare
-from teamslam.sim.cli.importing import import_into
-from teamslam.sim.cli.options import (
-    ANY_PORT,
-    FAILED,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
     INTERRUPTED,
-    LOOPBACK,
-    WRONG_USE,
-    Dataset,
-    EstimatorOption,
-    FusionOption,
-    IdentitiesOption,
-    JsonFile,
-    Keys,
-    Localise,
-    MapFiles,
-    Peers,
-    Pieces,
-    Robots,
-    Seed,
-    SpeedText,
-    check_joins,
-    check_localises,
-    check_pieces,
+    Group,
+    argument,
     fail,
-    over_tls,
-    parse_speed,
-    refuse_open_door,
-    saved_maps,
-    scenario_for,
-    scenario_of,
-    set_aside,
-    write_json,
+    network,
+    option,
+    output_option,
+    rare,
+    refuse,
 )
+from teamslam.sim.cli.importing import import_into
 from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 from teamslam.sim.cli.view import FoxglovePort, Open, Port, show_on_page
 from teamslam.sim.scenarios.scenario import (
@@ -71,30 +50,30 @@ def launch(
         str | None,
         argument("A built-in scenario or a .toml file; default: thesis, or the data set's own."),
     ] = None,
-    dataset: Dataset = None,
-    robots: Robots = None,
-    seed: Seed = None,
-    speed: SpeedText = "max",
+    dataset: opt.Dataset = None,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    speed: opt.SpeedText = "max",
     view: Annotated[bool, option("Show the run on a page, until Ctrl-C.", "--view")] = False,
     output: Annotated[
         Path | None, output_option("The run's folder; default: a new one below runs/.", "DIR")
     ] = None,
-    identities: IdentitiesOption = None,
+    identities: opt.IdentitiesOption = None,
     without_centre: Annotated[
         bool, option("No central computer: robots are peers.", "--without-centre")
     ] = False,
     report: Annotated[bool, option("Draw the pictures and write the report.")] = True,
     browser: Open = None,
-    map_: MapFiles = None,
-    localise: Localise = False,
+    map_: opt.MapFiles = None,
+    localise: opt.Localise = False,
     record: Annotated[
         Path | None, rare("The log to write; default: log.mcap in the run's folder.", "FILE")
     ] = None,
-    json_file: JsonFile = None,
-    pieces: Pieces = None,
-    estimator: EstimatorOption = None,
-    fusion: FusionOption = None,
-    peers: Peers = False,
+    json_file: opt.JsonFile = None,
+    pieces: opt.Pieces = None,
+    estimator: opt.EstimatorOption = None,
+    fusion: opt.FusionOption = None,
+    peers: opt.Peers = False,
     comm_range: Annotated[
         float | None,
         rare(
@@ -118,8 +97,8 @@ def launch(
     foxglove_port: FoxglovePort = None,
     listen: Annotated[
         str, network("Where the router listens; port 0: any free one.", "ENDPOINT")
-    ] = ANY_PORT,
-    keys: Keys = None,
+    ] = opt.ANY_PORT,
+    keys: opt.Keys = None,
     insecure: Annotated[
         bool, network("Without keys, admit everyone who reaches the router.")
     ] = False,
@@ -130,17 +109,17 @@ def launch(
     status 0 only if every process ended well and every robot is in the final map;
     else 1. 2: wrong use; 130: interrupted.
     """
-    pace = parse_speed(speed)
-    refuse_open_door(listen, keys=keys is not None, insecure=insecure)
+    pace = opt.parse_speed(speed)
+    opt.refuse_open_door(listen, keys=keys is not None, insecure=insecure)
     if dataset is not None:
         from teamslam.team.ros2.bags import is_bag
 
         if is_bag(dataset):
             output = output or _new_folder(dataset.stem or "bag")
             dataset = import_into(dataset, output / (dataset.stem or "bag"))
-    name = scenario or ("thesis" if dataset is None else scenario_for(dataset))
+    name = scenario or ("thesis" if dataset is None else opt.scenario_for(dataset))
     resolved = with_options(
-        scenario_of(name),
+        opt.scenario_of(name),
         robots=robots if pieces is None else pieces,
         seed=seed,
         estimator=estimator,
@@ -153,14 +132,14 @@ def launch(
         localise=localise,
     )
     if localise:
-        check_localises(map_, resolved)
+        opt.check_localises(map_, resolved)
     if pieces is not None:
-        check_pieces(resolved)
+        opt.check_pieces(resolved)
     resolved, missing, streams = _checked_world(resolved)
     if name == ASSUMED_NAME and dataset is not None and streams is not None:
         click.echo(_how_to_learn(dataset, streams), err=True)
-    if resolved.is_live and listen == ANY_PORT:
-        listen = LOOPBACK  # must be reachable by drivers
+    if resolved.is_live and listen == opt.ANY_PORT:
+        listen = opt.LOOPBACK  # must be reachable by drivers
     warnings = [
         *scenario_warnings(resolved),
         *([missing] if missing else []),
@@ -175,7 +154,7 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
-    check_joins(resolved, saved_maps(map_))
+    opt.check_joins(resolved, opt.saved_maps(map_))
     from teamslam.sim.launch.launch import Plan
 
     plan = Plan(
@@ -183,7 +162,7 @@ def launch(
         folder=folder,
         log=log,
         speed=pace,
-        listen=listen if keys is None else over_tls(listen),
+        listen=listen if keys is None else opt.over_tls(listen),
         views=views,
         end_silent_s=end_silent,
         keys=keys and keys.resolve(),
@@ -191,7 +170,7 @@ def launch(
         maps=tuple(map_ or ()),
     )
     for earlier_set in plan.earlier_sets:
-        set_aside(earlier_set)
+        opt.set_aside(earlier_set)
     page = (
         show_on_page(log, "127.0.0.1", port, foxglove_port, browser, growing=True)
         if view
@@ -224,10 +203,10 @@ def _launch(plan: "Plan") -> "Outcome":
         with show_live(_name_of(scenario) or f"{scenario.name}, seed {scenario.seed}") as show:
             return launch(plan, Starter(time.time_ns()), show)
     except LaunchError as error:
-        fail(str(error), FAILED)
+        fail(str(error))
     except KeyboardInterrupt:
         recorded_note = f"; {plan.log} holds what was recorded" if plan.log.exists() else ""
-        fail(f"interrupted: every process of the team was ended{recorded_note}", FAILED)
+        fail(f"interrupted: every process of the team was ended{recorded_note}")
 
 
 def _keep_showing(url: str, log: Path) -> None:
@@ -292,7 +271,7 @@ def _check_writable(path: Path) -> None:
         if is_new:  # a waiting reader must find the file complete
             path.unlink()
     except OSError as error:
-        fail(f"--json {path}: {error.strerror}; give another path", WRONG_USE)
+        refuse(f"--json {path}: {error.strerror}; give another path")
 
 
 def _new_folder(name: str) -> Path:
@@ -307,12 +286,12 @@ def _new_folder(name: str) -> Path:
 
 def _keep_earlier(log: Path) -> None:
     if log.exists() and not log.is_file():
-        fail(f"--record {log}: not a regular file; give the path of a new log", WRONG_USE)
+        refuse(f"--record {log}: not a regular file; give the path of a new log")
     if log.exists():
         from teamslam.team.recording.part_files import part_of, parts_of
 
         parts = parts_of(log)
-        aside = set_aside(log)
+        aside = opt.set_aside(log)
         for number, part in enumerate(parts[1:], 2):
             part.rename(part_of(aside, number))
 
@@ -393,6 +372,6 @@ def _conclude(
     console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
     console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
     console.print(f"show  teamslam view {outcome.log}", highlight=False, soft_wrap=True)
-    write_json(json_file, figures)
+    opt.write_json(json_file, figures)
     if outcome.failures:
-        fail("\n".join(outcome.failures), FAILED)
+        fail("\n".join(outcome.failures))

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Annotated
 
+from teamslam.sim.cli import options as opt
 from teamslam.sim.cli.commands import Group, argument, option, output_option
 from teamslam.sim.cli.launch import launch
-from teamslam.sim.cli.options import Dataset, JsonFile, Robots, Seed, SpeedText
 from teamslam.sim.cli.rerun import rerun
 
 app = Group()
@@ -22,12 +22,12 @@ def localise(
             "A scenario, or a log or the folder of a run; default: as of launch.", "[SCENARIO|LOG]"
         ),
     ] = None,
-    dataset: Dataset = None,
-    robots: Robots = None,
-    seed: Seed = None,
-    speed: SpeedText = "max",
+    dataset: opt.Dataset = None,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    speed: opt.SpeedText = "max",
     output: Annotated[Path | None, output_option("The run's folder.", "DIR")] = None,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Localise robots in a saved map, without mapping.
 

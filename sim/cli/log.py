@@ -9,19 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import click
 from click.exceptions import Exit
 
-from teamslam.sim.cli.commands import Group, argument, option, output_option
-from teamslam.sim.cli.options import (
-    FAILED,
-    WRONG_USE,
-    JsonFile,
-    LogArgument,
-    count_noun,
-    fail,
-    refuse_existing,
-    tell_holes,
-    warn_of_holes,
-    write_json,
-)
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import FAILED, Group, argument, option, output_option, refuse
 from teamslam.sim.cli.recorded import repair
 from teamslam.team.extras import install_command
 from teamslam.team.wire.text import one_line
@@ -59,9 +48,9 @@ class Format(StrEnum):
 
 @app.declare("teamslam log info runs/first")
 def info(
-    log: LogArgument,
+    log: opt.LogArgument,
     keys: Annotated[bool, option("A row per key, not per channel.", "--keys")] = False,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Show the contents of a log: channels, messages, bytes, rates, span in team time, metadata."""
     from dataclasses import asdict
@@ -92,7 +81,7 @@ def info(
         console.print(_key_table(summary.keys, span[0], by_key=keys))
     for name, value in opened.metadata.items():
         console.print(Text(one_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
-    tell_holes(log, lacks)
+    opt.tell_holes(log, lacks)
     figures = {
         "log": str(log),
         "team": opened.team,
@@ -103,11 +92,11 @@ def info(
         "metadata": opened.metadata,
         "damaged": summary.damaged,
     }
-    write_json(json_file, figures)
+    opt.write_json(json_file, figures)
 
 
 @app.declare("teamslam log check runs/first")
-def check(log: LogArgument) -> None:
+def check(log: opt.LogArgument) -> None:
     """Check that a log is whole and valid: checksums, schemas, counters, order, every message.
 
     Exit status 1 if anything is wrong; each finding is one line.
@@ -125,7 +114,7 @@ def check(log: LogArgument) -> None:
 
 @app.declare("teamslam log cut runs/first --from 60 --to 120 -o minute.mcap")
 def cut(
-    log: LogArgument,
+    log: opt.LogArgument,
     output: NewLog,
     from_s: Annotated[
         float | None, option("Seconds after the first measurement.", "--from")
@@ -147,11 +136,11 @@ def cut(
     bounds = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
     given = [s for s in (from_s, to_s) if s is not None]
     if not (all(abs(s) < 4e9 for s in given) and bounds[0] < bounds[1]):
-        fail(f"--from {from_s} --to {to_s}: give seconds, the first before the second", WRONG_USE)
+        refuse(f"--from {from_s} --to {to_s}: give seconds, the first before the second")
     chosen = _channels(channels)
-    refuse_existing(output)
+    opt.refuse_existing(output)
     opened = open_log(log)
-    warn_of_holes(opened)
+    opt.warn_of_holes(opened)
     click.echo(f"{output}: {cut_log(opened, output, from_s, to_s, chosen)} messages")
 
 
@@ -164,15 +153,15 @@ def merge(
     from teamslam.team.recording.merge import merge as merge_logs
     from teamslam.team.recording.reader import open_log
 
-    refuse_existing(output)
+    opt.refuse_existing(output)
     merged = merge_logs([open_log(log) for log in logs], output)
     click.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
-    warn_of_holes(open_log(output))
+    opt.warn_of_holes(open_log(output))
 
 
 @app.declare("teamslam log export runs/first -o paths --format tum")
 def export(
-    log: LogArgument,
+    log: opt.LogArgument,
     output: Annotated[Path, output_option("A new folder.")],
     form: Annotated[
         Format,
@@ -193,11 +182,11 @@ def export(
     opened = open_log(log)
     chosen = _channels(channels)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        fail(f"{output} is there and not an empty folder: give a new one", WRONG_USE)
-    warn_of_holes(opened)
+        refuse(f"{output} is there and not an empty folder: give a new one")
+    opt.warn_of_holes(opened)
     if form in (Format.UTIAS, Format.TUM, Format.ROSBAG2, *FORMATS):
         if channels is not None:
-            fail(f"--channels is for tables: {form} is of all that the format has", WRONG_USE)
+            refuse(f"--channels is for tables: {form} is of all that the format has")
         if form is Format.TUM or form in FORMATS:
             is_tum = form is Format.TUM
             for path in (
@@ -207,7 +196,7 @@ def export(
             return
         if form is Format.ROSBAG2:
             for topic, count in sorted(export_rosbag2(opened, output).items()):
-                click.echo(f"{output}: {topic}: {count_noun(count, 'message')}")
+                click.echo(f"{output}: {topic}: {opt.count_noun(count, 'message')}")
             return
         for number, robot in enumerate(export_utias(opened, output), 1):
             click.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
@@ -215,11 +204,11 @@ def export(
     from teamslam.team.recording.tables import CsvTable, ParquetTable, export_tables
 
     if form is Format.PARQUET and find_spec("pyarrow") is None:
-        fail(f"--format parquet needs pyarrow: {install_command('parquet')}", WRONG_USE)
+        refuse(f"--format parquet needs pyarrow: {install_command('parquet')}")
     table = ParquetTable if form is Format.PARQUET else CsvTable
     exported = export_tables(opened, output, chosen, table)
     for path, rows in exported.rows.items():
-        click.echo(f"{path}: {count_noun(rows, 'row')}")
+        click.echo(f"{path}: {opt.count_noun(rows, 'row')}")
     if exported.unsound:
         click.echo(f"left out: {exported.unsound} unsound messages", err=True)
 
@@ -233,7 +222,7 @@ def _channels(names: str | None) -> "list[Channel] | None":
     given = [name.strip() for name in names.split(",")]
     unknown = [name for name in given if name not in known]
     if unknown:
-        fail(f"--channels: no channel {unknown[0]!r}; there are {', '.join(known)}", WRONG_USE)
+        refuse(f"--channels: no channel {unknown[0]!r}; there are {', '.join(known)}")
     return [known[name] for name in dict.fromkeys(given)]
 
 

@@ -11,8 +11,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import click  # noqa: E402 - the threads of BLAS are set before anything imports NumPy
 
-from teamslam.sim.cli.commands import Group  # noqa: E402
-from teamslam.sim.cli.options import FAILED, INTERRUPTED, WRONG_USE, fail, print_error  # noqa: E402
+from teamslam.sim.cli import commands  # noqa: E402
+from teamslam.sim.cli.commands import FAILED, INTERRUPTED, WRONG_USE, Group  # noqa: E402
 
 STUDIES = "teamslam.sim.studies"
 SECTIONS: Mapping[str, Mapping[str, str]] = {
@@ -89,15 +89,14 @@ def _imported(name: str) -> click.Command:
 
 
 def _missing(name: str) -> click.Command:
-    def refuse() -> None:
-        fail(
+    def missing() -> None:
+        commands.refuse(
             f"`teamslam {name}` is a study, and this installation is without the folder "
-            "sim/studies: install teamslam with it",
-            WRONG_USE,
+            "sim/studies: install teamslam with it"
         )
 
     context = {"allow_extra_args": True, "ignore_unknown_options": True}
-    return click.Command(name, context, refuse, hidden=True, add_help_option=False)
+    return click.Command(name, context, missing, hidden=True, add_help_option=False)
 
 
 app = _Team(
@@ -131,7 +130,7 @@ def main() -> None:
         if advice is None:
             raise
         status, text = advice
-        print_error(text)
+        commands.print_error(text)
         sys.exit(status)
 
 

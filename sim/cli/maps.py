@@ -6,20 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 import click
 import msgspec
 
-from teamslam.sim.cli.commands import Group, argument, option, output_option
-from teamslam.sim.cli.options import (
-    FAILED,
-    LOOPBACK,
-    WRONG_USE,
-    Connect,
-    JsonFile,
-    Keys,
-    TeamOption,
-    connect_bus,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
+    Group,
+    argument,
     fail,
     failing,
-    saved_maps,
-    write_json,
+    option,
+    output_option,
+    refuse,
+    refusing,
 )
 from teamslam.team.wire.arrays import ids
 
@@ -46,8 +42,8 @@ def save(
     team: Annotated[
         str | None, option("A running team, whose centre is asked for its map.", "NAME")
     ] = None,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     patience: Annotated[float, option("Seconds to wait for the running centre.", least=0.1)] = 60.0,
 ) -> None:
     """Save the final map of a run as one Gaussian, for the teams of later days.
@@ -59,8 +55,8 @@ def save(
     from teamslam.team.saved_map import SavedMapError, map_name, write_map
 
     if (log is None) == (team is None):
-        fail("give either a log or, for a running team, --team NAME", WRONG_USE)
-    with failing(WRONG_USE, SavedMapError):
+        refuse("give either a log or, for a running team, --team NAME")
+    with refusing(SavedMapError):
         named = map_name(name or output.stem)
         found = _map_of_log(log) if log is not None else _map_of_team(team, connect, keys, patience)
         saved = msgspec.structs.replace(found, name=named)
@@ -79,7 +75,7 @@ def _map_of_log(log: Path) -> "SavedMap":
     from teamslam.central.saved_maps import NothingToSaveError
     from teamslam.team.recording.reader import open_log
 
-    with failing(FAILED, RerunError, NothingToSaveError, at=log):
+    with failing(RerunError, NothingToSaveError, at=log):
         return recorded_map(index_log(open_log(log)), "site")
 
 
@@ -89,21 +85,21 @@ def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: fl
     from teamslam.team.wire.codec import decoded
     from teamslam.team.wire.messages import FoldRequest, SavedMap
 
-    with connect_bus(str(team), connect, keys, "operator") as bus, failing(FAILED, BusError):
+    with opt.connect_bus(str(team), connect, keys, "operator") as bus, failing(BusError):
         replies = bus.ask(SITE, "", FoldRequest(stamp_ns=0), patience)
     if not replies:
-        fail(f"no centre of the team {team} is running at {connect}: save from its log", FAILED)
+        fail(f"no centre of the team {team} is running at {connect}: save from its log")
     return decoded(replies[-1], SavedMap)
 
 
 @app.declare("teamslam map show site.map")
-def show(file: Annotated[Path, argument("A saved map.")], json_file: JsonFile = None) -> None:
+def show(file: Annotated[Path, argument("A saved map.")], json_file: opt.JsonFile = None) -> None:
     """Show a saved map: where it comes from, and its landmarks as CSV."""
     from teamslam.team.saved_map import map_figures
 
-    saved = saved_maps([file])[0]
+    saved = opt.saved_maps([file])[0]
     figures = map_figures(saved)
-    write_json(json_file, figures)
+    opt.write_json(json_file, figures)
     landmarks, own = figures.pop("landmarks"), figures.pop("own")
     for key, value in figures.items():
         if value or not isinstance(value, list | tuple):
@@ -125,9 +121,9 @@ def show(file: Annotated[Path, argument("A saved map.")], json_file: JsonFile = 
 @app.declare("teamslam map peer r3 --team waypoints")
 def peer(
     robot: Annotated[str, argument("The peer that is to fold, as r3.")],
-    team: TeamOption,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    team: opt.TeamOption,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     patience: Annotated[float, option("Seconds to wait for the answer.", least=0.1)] = 60.0,
 ) -> None:
     """Request a peer's fold of its present set (`--fold request`), and print the map as CSV."""
@@ -137,10 +133,10 @@ def peer(
     from teamslam.team.wire.codec import decoded
     from teamslam.team.wire.messages import FoldRequest, FusedMap
 
-    with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, BusError):
+    with opt.connect_bus(team, connect, keys, "operator") as bus, failing(BusError):
         replies = bus.ask(FOLD, robot, FoldRequest(stamp_ns=0), patience)
     if not replies:
-        fail(f"{robot} has no map to give: is it a peer of {team} that is running?", FAILED)
+        fail(f"{robot} has no map to give: is it a peer of {team} that is running?")
     fused = decoded(replies[-1], FusedMap)
     click.echo("landmark,x,y")
     means = floats(fused.means, "means").reshape(-1, 2)

@@ -10,35 +10,16 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import click
 
-from teamslam.sim.cli.commands import Group, argument, option, output_option, rare
-from teamslam.sim.cli.options import (
-    FAILED,
-    LOOPBACK,
-    WRONG_USE,
-    Connect,
-    Dataset,
-    EstimatorOption,
-    FusionOption,
-    Keys,
-    MapFiles,
-    Peers,
-    Robots,
-    ScenarioArgument,
-    Seed,
-    SpeedText,
-    check_joins,
-    check_names,
-    connect_bus,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
+    Group,
+    argument,
     fail,
-    failing,
-    over_tls,
-    own_keys,
-    parse_speed,
-    refuse_existing,
-    refuse_open_door,
-    saved_maps,
-    scenario_of,
-    signer_of,
+    option,
+    output_option,
+    rare,
+    refuse,
+    refusing,
 )
 from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
@@ -64,8 +45,10 @@ def _connected(scenario: Scenario, connect: str) -> None:
 
 @app.declare("teamslam router --listen tcp/192.168.1.5:7447 --keys keys")
 def router(
-    listen: Annotated[str, option("Where to listen; port 0: any free one.", "ENDPOINT")] = LOOPBACK,
-    keys: Keys = None,
+    listen: Annotated[
+        str, option("Where to listen; port 0: any free one.", "ENDPOINT")
+    ] = opt.LOOPBACK,
+    keys: opt.Keys = None,
     insecure: Annotated[
         bool, option("Without keys, admit every process that reaches it, also from other machines.")
     ] = False,
@@ -80,9 +63,9 @@ def router(
     from teamslam.team.shell import process
     from teamslam.team.wire.zenoh.router import router as zenoh_router
 
-    refuse_open_door(listen, keys=keys is not None, insecure=insecure)
-    own = None if keys is None else (own_keys(keys, "router"), load_roster(keys))
-    at = over_tls(listen) if keys else listen
+    opt.refuse_open_door(listen, keys=keys is not None, insecure=insecure)
+    own = None if keys is None else (opt.own_keys(keys, "router"), load_roster(keys))
+    at = opt.over_tls(listen) if keys else listen
     with process("router", endless=True) as stop, zenoh_router(at, own) as endpoint:
         if own is not None and own[1].revoked:
             _LOG.info("revoked and refused: %s", ", ".join(sorted(own[1].revoked)))
@@ -92,35 +75,37 @@ def router(
                 fail(
                     f"{own[0].certificate} has expired, so every link is closed: renew it by "
                     f"`teamslam keys {own[0].team} -o DIR --renew router`, copy it, and start the "
-                    "router again",
-                    FAILED,
+                    "router again"
                 )
 
 
 @app.declare("teamslam world waypoints --speed max")
 def world(
-    scenario: ScenarioArgument,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    speed: SpeedText = "1",
+    scenario: opt.ScenarioArgument,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
+    speed: opt.SpeedText = "1",
     recorder: Annotated[bool, rare("Wait for a recorder before the first measurement.")] = True,
     cache: Annotated[
         int | None,
         rare("Measurements per robot that can be asked for again; default: all.", "N", least=0),
     ] = None,
-    robots: Robots = None,
-    seed: Seed = None,
-    dataset: Dataset = None,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    dataset: opt.Dataset = None,
 ) -> None:
     """Run the world: a simulator or a data set that publishes every robot's measurements."""
     from teamslam.sim.publisher.main import run_world
     from teamslam.sim.scenarios.source import streams_of
     from teamslam.team.shell import process
 
-    pace = parse_speed(speed)
-    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
+    pace = opt.parse_speed(speed)
+    resolved = with_options(opt.scenario_of(scenario), robots=robots, seed=seed, dataset=dataset)
     streams = streams_of(resolved)
-    with process("world") as stop, connect_bus(resolved.team, connect, keys, "world", stop) as bus:
+    with (
+        process("world") as stop,
+        opt.connect_bus(resolved.team, connect, keys, "world", stop) as bus,
+    ):
         _connected(resolved, connect)
         for text in scenario_warnings(resolved):
             _LOG.warning("%s", text)
@@ -129,21 +114,21 @@ def world(
 
 @app.declare("teamslam robot waypoints r1 --connect tcp/192.168.1.5:7447")
 def robot(
-    scenario: ScenarioArgument,
+    scenario: opt.ScenarioArgument,
     name: Annotated[str, argument("The robot's name in the scenario, as r1.")],
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
-    robots: Robots = None,
-    seed: Seed = None,
-    estimator: EstimatorOption = None,
-    fusion: FusionOption = None,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    estimator: opt.EstimatorOption = None,
+    fusion: opt.FusionOption = None,
     log: Annotated[
         Path | None,
         option(
             "Its own log: what it sends and receives; `teamslam log merge` joins such logs.", "FILE"
         ),
     ] = None,
-    peers: Peers = False,
+    peers: opt.Peers = False,
     store: Annotated[
         Path | None,
         rare(
@@ -158,7 +143,7 @@ def robot(
             "always|request|end",
         ),
     ] = "always",
-    map_: MapFiles = None,
+    map_: opt.MapFiles = None,
 ) -> None:
     """Run a robot, which estimates from its sensor stream and publishes submaps, maps and
     poses.
@@ -170,7 +155,7 @@ def robot(
     from teamslam.team.shell import process
 
     resolved = with_options(
-        scenario_of(scenario),
+        opt.scenario_of(scenario),
         robots=robots,
         seed=seed,
         estimator=estimator,
@@ -180,15 +165,15 @@ def robot(
     config = resolved.config_of(name)
     if config is None:
         known = ", ".join(each.id for each in resolved.robots)
-        fail(f"{scenario} has no robot {name!r}; its robots: {known}", WRONG_USE)
-    check_names(resolved.team, name)
-    maps = saved_maps(map_)
+        refuse(f"{scenario} has no robot {name!r}; its robots: {known}")
+    opt.check_names(resolved.team, name)
+    maps = opt.saved_maps(map_)
     if maps and not resolved.peers:
-        fail("--map is for the centre, or for a robot with --peers", WRONG_USE)
+        refuse("--map is for the centre, or for a robot with --peers")
     with (
         process(f"robot-{name}") as stop,
         _own_log(log, resolved) as tap,
-        connect_bus(resolved.team, connect, keys, f"robot-{name}", stop) as bus,
+        opt.connect_bus(resolved.team, connect, keys, f"robot-{name}", stop) as bus,
     ):
         bus.tap = tap
         _connected(resolved, connect)
@@ -222,9 +207,9 @@ def _peer_shell(
     from teamslam.team.peers.set_file import SetFileError
 
     if fold not in get_args(FoldWhen):
-        fail(f"--fold is always, request or end, not {fold!r}", WRONG_USE)
-    signer = signer_of(keys, f"robot-{config.id}", scenario.team)
-    with failing(WRONG_USE, SetFileError):
+        refuse(f"--fold is always, request or end, not {fold!r}")
+    signer = opt.signer_of(keys, f"robot-{config.id}", scenario.team)
+    with refusing(SetFileError):
         door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
         return PeerShell(
             door,
@@ -242,9 +227,9 @@ def _peer_shell(
 
 @app.declare("teamslam central waypoints")
 def central(
-    scenario: ScenarioArgument,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    scenario: opt.ScenarioArgument,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     patience: Annotated[
         float | None,
         option(
@@ -254,11 +239,11 @@ def central(
             least=0.0,
         ),
     ] = None,
-    robots: Robots = None,
-    seed: Seed = None,
-    estimator: EstimatorOption = None,
-    fusion: FusionOption = None,
-    peers: Peers = False,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    estimator: opt.EstimatorOption = None,
+    fusion: opt.FusionOption = None,
+    peers: opt.Peers = False,
     store: Annotated[
         Path | None,
         option(
@@ -268,7 +253,7 @@ def central(
             "FILE",
         ),
     ] = None,
-    map_: MapFiles = None,
+    map_: opt.MapFiles = None,
 ) -> None:
     """Run the central computer, which fuses the robots' maps and broadcasts the fused map back.
 
@@ -278,21 +263,21 @@ def central(
     from teamslam.team.shell import process
 
     resolved = with_options(
-        scenario_of(scenario),
+        opt.scenario_of(scenario),
         robots=robots,
         seed=seed,
         estimator=estimator,
         fusion=fusion,
         peers=peers,
     )
-    maps = saved_maps(map_)
-    check_joins(resolved, maps)
+    maps = opt.saved_maps(map_)
+    opt.check_joins(resolved, maps)
     with (
         process("central") as stop,
-        connect_bus(resolved.team, connect, keys, "central", stop) as bus,
+        opt.connect_bus(resolved.team, connect, keys, "central", stop) as bus,
     ):
         _connected(resolved, connect)
-        with failing(WRONG_USE, SetFileError):
+        with refusing(SetFileError):
             _central_shell(bus, resolved, stop, store, patience, keys, maps).run()
 
 
@@ -320,16 +305,16 @@ def _central_shell(
             store=store,
             maps=maps,
         )
-    signer = signer_of(keys, "central", scenario.team)
+    signer = opt.signer_of(keys, "central", scenario.team)
     return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer, maps=maps)
 
 
 @app.declare("teamslam record waypoints -o team.mcap")
 def record(
-    scenario: ScenarioArgument,
+    scenario: opt.ScenarioArgument,
     output: Annotated[Path, output_option("The MCAP file to write.", "FILE")],
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     resume: Annotated[
         bool,
         option(
@@ -357,7 +342,7 @@ def record(
     from teamslam.team.shell import process
     from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL, robot_node
 
-    resolved = scenario_of(scenario)
+    resolved = opt.scenario_of(scenario)
     output.parent.mkdir(parents=True, exist_ok=True)
     metadata = {
         **provenance(),
@@ -366,10 +351,10 @@ def record(
     }
     exists = output.exists()
     if exists and not output.is_file():
-        refuse_existing(output)
+        opt.refuse_existing(output)
     peers = [robot.id for robot in resolved.robots] if resolved.peers else []
     ends = (FINAL_MAP, TEAM_FINAL) if peers else (FINAL_MAP,)
-    with failing(WRONG_USE, LogError):
+    with refusing(LogError):
         is_over = exists and not check_continues(
             output, resolved.team, metadata, same_run=resume, ends=ends
         )
@@ -387,7 +372,7 @@ def record(
         configurations = [announce_configuration("world", 0, 0, resolved)]
     with (
         process("recorder", endless=True) as stop,
-        connect_bus(resolved.team, connect, keys, "recorder", stop) as bus,
+        opt.connect_bus(resolved.team, connect, keys, "recorder", stop) as bus,
     ):
         recorder, inventory = next_part(output, resolved.team, metadata)
         _connected(resolved, connect)
@@ -422,7 +407,7 @@ def _join_parts(log: Path) -> list[Path]:
 
 def _fail_if_provisional(parts: Sequence[Path], ends: "Sequence[Channel]") -> None:
     if lacks := _lacking_in(parts, ends):
-        fail(lacks, FAILED)
+        fail(lacks)
 
 
 def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:

@@ -6,23 +6,21 @@ import math
 import os
 import re
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from errno import EACCES
 from ipaddress import ip_address
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import click
-from click.exceptions import Exit
 
-from teamslam.sim.cli.commands import argument, network, option, rare
+from teamslam.sim.cli.commands import argument, network, option, rare, refuse, refusing
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
 from teamslam.team.config import MAP, Estimator, FusionRule
-from teamslam.team.wire.text import one_line, printable_lines
+from teamslam.team.wire.text import one_line
 
 if TYPE_CHECKING:
     from teamslam.team.keys.credentials import Credentials
@@ -34,10 +32,6 @@ if TYPE_CHECKING:
 
 MOST_HOLES = 5
 """Most log gaps that a command prints; `teamslam log check` prints all."""
-WRONG_USE = 2
-FAILED = 1
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, by the shell's convention."""
 
 
 def check_folder(path: Path) -> None:
@@ -47,7 +41,7 @@ def check_folder(path: Path) -> None:
         if not os.access(path, os.W_OK):
             raise PermissionError(EACCES, os.strerror(EACCES))
     except OSError as error:
-        fail(f"-o {path}: {error.strerror}; give a folder to write in", WRONG_USE)
+        refuse(f"-o {path}: {error.strerror}; give a folder to write in")
 
 
 def _either(names: object) -> str:
@@ -117,10 +111,9 @@ SpeedText = Annotated[
 def check_pieces(scenario: Scenario) -> None:
     """Exit unless the scenario is a data set of one robot with detections."""
     if not isinstance(scenario.world, UnlabelledWorld | GraphWorld):
-        fail(
+        refuse(
             "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
-            "--dataset, or --robots for other worlds",
-            WRONG_USE,
+            "--dataset, or --robots for other worlds"
         )
 
 
@@ -171,33 +164,12 @@ def is_loopback(endpoint: str) -> bool:
 def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
     """Exit if strangers could reach a router that admits everyone."""
     if "/" not in listen:
-        fail(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT", WRONG_USE)
+        refuse(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT")
     if not (keys or insecure or is_loopback(listen)):
-        fail(
+        refuse(
             f"--listen {listen}: any process that reaches it could end the run or forge its map: "
-            "give --keys DIR (see `teamslam keys`), or --insecure where nobody else can reach it",
-            WRONG_USE,
+            "give --keys DIR (see `teamslam keys`), or --insecure where nobody else can reach it"
         )
-
-
-def fail(message: str, status: int) -> NoReturn:
-    """Print an error and exit with this status."""
-    print_error(message)
-    raise Exit(status)
-
-
-def print_error(message: str) -> None:
-    """Print an error on stderr."""
-    click.secho(f"error: {printable_lines(message)}", fg="red", err=True)
-
-
-@contextmanager
-def failing(status: int, *errors: type[Exception], at: object = "") -> Iterator[None]:
-    """Exit with this status and the text of such an error, after the text of `at`."""
-    try:
-        yield
-    except errors as error:
-        fail(f"{at}: {error}" if at else str(error), status)
 
 
 def write_json(path: Path | None, figures: object) -> None:
@@ -214,7 +186,7 @@ def write_json(path: Path | None, figures: object) -> None:
 def refuse_existing(path: Path) -> None:
     """Exit if the file or folder exists."""
     if path.exists():
-        fail(f"{path} exists: choose another name or remove it", WRONG_USE)
+        refuse(f"{path} exists: choose another name or remove it")
 
 
 def warn_of_holes(log: "Log") -> None:
@@ -257,7 +229,7 @@ def parse_speed(text: str) -> float:
     except ValueError:
         speed = math.nan
     if not (speed > 0.0 and math.isfinite(speed)):
-        fail(f"--speed {text}: give a positive number, or max", WRONG_USE)
+        refuse(f"--speed {text}: give a positive number, or max")
     return speed
 
 
@@ -269,9 +241,9 @@ def parse_start(text: str) -> tuple[str, tuple[float, ...]]:
     except ValueError:
         pose = ()
     if len(pose) not in (3, 5) or (colon and not robot):
-        fail(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57", WRONG_USE)
+        refuse(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57")
     if abs(pose[2]) > 2.0 * math.pi:
-        fail(f"--start {text}: theta is in radians, in one turn: {pose[2]:g} is not", WRONG_USE)
+        refuse(f"--start {text}: theta is in radians, in one turn: {pose[2]:g} is not")
     return robot, pose
 
 
@@ -304,27 +276,27 @@ def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
         return []
     from teamslam.team.saved_map import SavedMapError, read_map  # a log's reader comes with it
 
-    with failing(WRONG_USE, SavedMapError):
+    with refusing(SavedMapError):
         found = [read_map(path) for path in paths]
     names = sorted(each.name for each in found)
     twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:
-        fail(f"two maps have the name {twice}: save one of them by another --name", WRONG_USE)
+        refuse(f"two maps have the name {twice}: save one of them by another --name")
     return found
 
 
 def check_joins(scenario: "Scenario", maps: "Sequence[SavedMap]") -> None:
     """Exit with 2 where maps are given to a fusion rule that joins no submaps."""
     if maps and scenario.central.fusion != "join":
-        fail(f"--map: the fusion rule {scenario.central.fusion} joins no saved map", WRONG_USE)
+        refuse(f"--map: the fusion rule {scenario.central.fusion} joins no saved map")
 
 
 def check_localises(maps: "Sequence[Path] | None", scenario: "Scenario | None" = None) -> None:
     """Exit with 2 unless robots can be localised: in one map, by a centre."""
     if len(maps or ()) != 1:
-        fail("--localise: give one saved map by --map", WRONG_USE)
+        refuse("--localise: give one saved map by --map")
     if scenario is not None and (scenario.peers or not scenario.centre):
-        fail("--localise: a team without a centre extends its map; launch it with one", WRONG_USE)
+        refuse("--localise: a team without a centre extends its map; launch it with one")
 
 
 def check_names(team: str, robot: str | None = None) -> None:
@@ -332,9 +304,9 @@ def check_names(team: str, robot: str | None = None) -> None:
     from teamslam.team.keys.roster import ROBOT, TEAM
 
     if robot is not None and not ROBOT.fullmatch(robot.removeprefix(MAP)):
-        fail(f"{robot!r} is no robot's name", WRONG_USE)
+        refuse(f"{robot!r} is no robot's name")
     if not TEAM.fullmatch(team):
-        fail(f"{team!r} is no team's name", WRONG_USE)
+        refuse(f"{team!r} is no team's name")
 
 
 def signer_of(keys: Path | None, node: str, team: str) -> "Signer | None":

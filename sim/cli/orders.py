@@ -6,23 +6,16 @@ from typing import Annotated, Any
 import click
 
 from teamslam.central.desk.names import in_order
-from teamslam.sim.cli.commands import Group, argument, option, output_option
-from teamslam.sim.cli.options import (
-    FAILED,
-    LOOPBACK,
-    WRONG_USE,
-    Connect,
-    JsonFile,
-    Keys,
-    Robots,
-    TeamOption,
-    check_names,
-    connect_bus,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
+    Group,
+    argument,
     fail,
     failing,
-    scenario_of,
-    signer_of,
-    write_json,
+    option,
+    output_option,
+    refuse,
+    refusing,
 )
 from teamslam.sim.scenarios.scenario import with_options
 from teamslam.team.wire.arrays import ids
@@ -35,9 +28,9 @@ app = Group()
 @app.declare("teamslam withdraw r3 --team waypoints --reason 'wheel is loose'")
 def withdraw(
     robot: Annotated[str, argument("The robot's name, as r3.")],
-    team: TeamOption,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    team: opt.TeamOption,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     reason: Reason = "ordered",
     patience: Annotated[float, option("Seconds to wait for a map without it.", least=0.0)] = 60.0,
 ) -> None:
@@ -48,9 +41,9 @@ def withdraw(
     from teamslam.central.desk.orders import WithdrawError
     from teamslam.central.desk.orders import withdraw as order
 
-    check_names(team, robot)
-    with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, WithdrawError):
-        fused = order(bus, robot, reason, patience, signer_of(keys, "operator", team))
+    opt.check_names(team, robot)
+    with opt.connect_bus(team, connect, keys, "operator") as bus, failing(WithdrawError):
+        fused = order(bus, robot, reason, patience, opt.signer_of(keys, "operator", team))
     landmarks = len(ids(fused.ids, "ids"))
     click.echo(f"{robot} is withdrawn; the map of {landmarks} landmarks goes without it")
 
@@ -60,9 +53,9 @@ def verdict(
     word: Annotated[str, argument("same: they are one landmark; different: two.")],
     first: Annotated[str, argument("robot/incarnation/submap/landmark, as r1/1/12/7.")],
     second: Annotated[str, argument("The other one, likewise.")],
-    team: TeamOption,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    team: opt.TeamOption,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     reason: Reason = "seen by an operator",
     withdraw: Annotated[bool, option("Withdraw this verdict, for good.", "--withdraw")] = False,
     patience: Annotated[
@@ -79,19 +72,21 @@ def verdict(
     from teamslam.team.wire.messages import Judgement
 
     if word not in ("same", "different"):
-        fail(f"{word!r} is no verdict: same or different", WRONG_USE)
-    check_names(team)
-    with failing(WRONG_USE, ValueError):
+        refuse(f"{word!r} is no verdict: same or different")
+    opt.check_names(team)
+    with refusing(ValueError):
         one, two = local_landmark(first), local_landmark(second)
     if one == two:
-        fail(f"{first} is one landmark, and needs no verdict", WRONG_USE)
-    with connect_bus(team, connect, keys, "operator") as bus:
+        refuse(f"{first} is one landmark, and needs no verdict")
+    with opt.connect_bus(team, connect, keys, "operator") as bus:
         try:
             judgement = Judgement(first=one, second=two, same=word == "same")
-            signer = signer_of(keys, "operator", team)
+            signer = opt.signer_of(keys, "operator", team)
             fused = judge(bus, judgement, reason, patience, signer, withdrawn=withdraw)
+        except NoRobotError as error:
+            refuse(str(error))
         except WithdrawError as error:
-            fail(str(error), WRONG_USE if isinstance(error, NoRobotError) else FAILED)
+            fail(str(error))
     opposite = "different" if word == "same" else "same"
     chain = () if withdraw else contradicting(judgement, fused.verdicts)
     if len(chain) > 1:
@@ -102,14 +97,13 @@ def verdict(
         fail(
             f"these verdicts contradict each other: {every}; yet {describe_verdict(apart)}, which "
             "is what holds, so that one of the others has no effect: withdraw what is wrong by "
-            "`teamslam verdict … --withdraw`",
-            FAILED,
+            "`teamslam verdict … --withdraw`"
         )
     if chain:
         remedy = f"`teamslam verdict {opposite} {first} {second} --withdraw` withdraws that"
         contradiction = f"{first} and {second} have an earlier verdict, {opposite}"
         if word == "same":
-            fail(f"{contradiction}, which is what holds; {remedy}", FAILED)
+            fail(f"{contradiction}, which is what holds; {remedy}")
         click.echo(f"warning: {contradiction}; different is what holds; {remedy}", err=True)
     landmarks = len(ids(fused.ids, "ids"))
     are = "no longer have the verdict that they are" if withdraw else "are"
@@ -118,12 +112,12 @@ def verdict(
 
 @app.declare("teamslam end --team waypoints\nteamslam end --team waypoints --without r3")
 def end(
-    team: TeamOption,
+    team: opt.TeamOption,
     without: Annotated[
         str | None, option("A lost robot, for which the team no longer waits.")
     ] = None,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     reason: Reason = "ordered",
     patience: Annotated[
         float, option("Seconds to wait for the centre to follow.", least=0.0)
@@ -138,22 +132,22 @@ def end(
     """
     from teamslam.central.desk.orders import WithdrawError, end_team, give_up
 
-    check_names(team, without)
-    with connect_bus(team, connect, keys, "operator") as bus, failing(FAILED, WithdrawError):
+    opt.check_names(team, without)
+    with opt.connect_bus(team, connect, keys, "operator") as bus, failing(WithdrawError):
         if without is None:
             end_team(bus, reason, patience)
         else:
-            give_up(bus, without, reason, patience, signer_of(keys, "operator", team))
+            give_up(bus, without, reason, patience, opt.signer_of(keys, "operator", team))
     click.echo(f"the team no longer waits for {without}" if without else "the team ends")
 
 
 @app.declare("teamslam status --team waypoints")
 def status(
-    team: TeamOption,
-    connect: Connect = LOOPBACK,
-    keys: Keys = None,
+    team: opt.TeamOption,
+    connect: opt.Connect = opt.LOOPBACK,
+    keys: opt.Keys = None,
     seconds: Annotated[float, option("Seconds for which the team is observed.", least=0.5)] = 3.0,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
     from rich.console import Console
@@ -161,14 +155,14 @@ def status(
 
     from teamslam.central.desk.presence import Presence
 
-    check_names(team)
+    opt.check_names(team)
     presence = Presence()
-    with connect_bus(team, connect, keys, "operator") as bus:
+    with opt.connect_bus(team, connect, keys, "operator") as bus:
         presence.take(bus, seconds)
         others = [] if presence.members else bus.other_teams()
     if not presence.members:
         but = f", but of {', '.join(others)}" if others else ""
-        fail(f"no node of the team {team} is at {connect}{but}: see --team, --connect", FAILED)
+        fail(f"no node of the team {team} is at {connect}{but}: see --team, --connect")
     rows = _rows(presence)
     table = Table("node", "there", "state", "measured", "per s", "taken", "clock [s]")
     for row in rows:
@@ -178,7 +172,7 @@ def status(
     advice = presence.advice()
     for line in advice:
         console.print(f"- {line}", markup=False, highlight=False, soft_wrap=True)
-    write_json(json_file, {"nodes": rows, "advice": advice})
+    opt.write_json(json_file, {"nodes": rows, "advice": advice})
 
 
 def _rows(presence: Any) -> list[dict[str, Any]]:
@@ -215,7 +209,7 @@ def keys(
     team: Annotated[str, argument("The team's name, as its scenario has it.")],
     output: Annotated[Path, output_option("The folder; it holds the authority, too.")],
     scenario: Annotated[str | None, option("For every robot of a scenario.", "SCENARIO")] = None,
-    robots: Robots = None,
+    robots: opt.Robots = None,
     robot: Annotated[
         list[str] | None, option("For a robot by name, too; again and again.", "NAME")
     ] = None,
@@ -240,12 +234,12 @@ def keys(
     from teamslam.team.keys.roster import REPLAY, ROBOT, TEAM, nodes_of
 
     if not TEAM.fullmatch(team):
-        fail(f"{team!r} is no team's name: letters, digits, dot, dash and underscore", WRONG_USE)
+        refuse(f"{team!r} is no team's name: letters, digits, dot, dash and underscore")
     if not days > 0.0:
-        fail(f"--days {days:g}: give a positive number", WRONG_USE)
+        refuse(f"--days {days:g}: give a positive number")
     names = list(robot or ())
     if scenario is not None:
-        resolved = with_options(scenario_of(scenario), robots=robots)
+        resolved = with_options(opt.scenario_of(scenario), robots=robots)
         names += [each.id for each in resolved.robots]
         if resolved.team != team:
             click.echo(
@@ -254,7 +248,7 @@ def keys(
             )
     for name in names:
         if not ROBOT.fullmatch(name):
-            fail(f"{name!r} is no robot's name", WRONG_USE)
+            refuse(f"{name!r} is no robot's name")
     made = make_keys(
         output,
         team,

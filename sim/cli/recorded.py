@@ -7,24 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 import click
 
 from teamslam.central.desk.pictures.style import Form, Look, Picture, Style, parsed_width
-from teamslam.sim.cli.commands import Group, argument, network, option, output_option, rare
-from teamslam.sim.cli.options import (
-    FAILED,
-    LOOPBACK,
-    WRONG_USE,
-    JsonFile,
-    Keys,
-    LogArgument,
-    SpeedText,
-    check_folder,
-    connect_bus,
-    count_noun,
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import (
+    Group,
+    argument,
     fail,
-    parse_speed,
-    refuse_existing,
-    refuse_open_door,
-    warn_of_holes,
-    write_json,
+    network,
+    option,
+    output_option,
+    rare,
+    refuse,
 )
 from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 
@@ -37,15 +29,15 @@ app = Group()
 
 @app.declare("teamslam replay runs/first --speed 20")
 def replay(
-    log: LogArgument,
-    speed: SpeedText = "1",
+    log: opt.LogArgument,
+    speed: opt.SpeedText = "1",
     connect: Annotated[
         str | None, network("The router to publish at; default: one of our own.", "ENDPOINT")
     ] = None,
     listen: Annotated[
         str, network("Where our own router listens; port 0: any free one.", "ENDPOINT")
-    ] = LOOPBACK,
-    keys: Keys = None,
+    ] = opt.LOOPBACK,
+    keys: opt.Keys = None,
     insecure: Annotated[
         bool, network("Without keys, admit every process that reaches our own router.")
     ] = False,
@@ -61,18 +53,18 @@ def replay(
     from teamslam.team.shell import process
     from teamslam.team.wire.zenoh.router import router
 
-    pace = parse_speed(speed)
+    pace = opt.parse_speed(speed)
     if connect is None:
         if keys is not None:
-            fail("--keys is for a router that is there: give --connect", WRONG_USE)
-        refuse_open_door(listen, keys=False, insecure=insecure)
+            refuse("--keys is for a router that is there: give --connect")
+        opt.refuse_open_door(listen, keys=False, insecure=insecure)
     opened = open_log(log)
-    warn_of_holes(opened)
+    opt.warn_of_holes(opened)
     hub = router(listen) if connect is None else nullcontext(connect)
     with (
         process("replay") as stop,
         hub as endpoint,
-        connect_bus(opened.team, endpoint, keys, "replay", stop) as bus,
+        opt.connect_bus(opened.team, endpoint, keys, "replay", stop) as bus,
     ):
         if connect is None:
             click.echo(f"listening at {endpoint}", err=True)
@@ -87,7 +79,7 @@ def replay(
     "teamslam report runs/first --picture map --style paper --format pdf"
 )
 def report(
-    log: LogArgument,
+    log: opt.LogArgument,
     output: Annotated[
         Path | None,
         output_option(
@@ -116,7 +108,7 @@ def report(
             section=PICTURES,
         ),
     ] = None,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Write page, pictures, tables and figures of a run from its log.
 
@@ -131,7 +123,7 @@ def report(
     from teamslam.team.recording.reader import open_log
 
     output = output or _folder_of(log)
-    check_folder(output)
+    opt.check_folder(output)
     width_in = _width(width, look)
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
@@ -148,7 +140,7 @@ def report(
         print_written(drawn.values(), console)
         if picture is not None:
             if not drawn:
-                fail(f"{log} has nothing to draw in the picture {picture}", FAILED)
+                fail(f"{log} has nothing to draw in the picture {picture}")
             return
     figures = to_json(
         evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
@@ -161,13 +153,12 @@ def report(
     try:
         print_written(write_report(run, output, figures), console)
     except OSError as error:
-        fail(f"-o {output}: can not write: {error.strerror}; give another folder", FAILED)
-    write_json(json_file, figures)
+        fail(f"-o {output}: can not write: {error.strerror}; give another folder")
+    opt.write_json(json_file, figures)
     if not opened.complete:
         fail(
             f"{opened.path} is cut, so the report is of the part before the cut: `teamslam repair "
-            f"{opened.path} -o FIXED.mcap` completes the log",
-            FAILED,
+            f"{opened.path} -o FIXED.mcap` completes the log"
         )
 
 
@@ -184,16 +175,16 @@ def _width(text: str | None, look: Look | None) -> float | None:
     if text is None:
         return None
     if look is not Look.PAPER:
-        fail("--width is of pictures for a paper: give --style paper, too", WRONG_USE)
+        refuse("--width is of pictures for a paper: give --style paper, too")
     try:
         return parsed_width(text)
     except ValueError as error:
-        fail(f"--width {error}", WRONG_USE)
+        refuse(f"--width {error}")
 
 
 @app.declare("teamslam repair team.mcap -o whole.mcap")
 def repair(
-    log: LogArgument,
+    log: opt.LogArgument,
     output: Annotated[Path, output_option("The new, complete log.", "FILE")],
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
@@ -201,11 +192,11 @@ def repair(
     from teamslam.team.recording.reader import log_file
     from teamslam.team.recording.repair import repair_bag, repair_log
 
-    refuse_existing(output)
+    opt.refuse_existing(output)
     log = log_file(log)
     if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
         bag = repair_bag(log, output)
-        click.echo(f"{output}: {count_noun(bag.messages, 'message')}")
+        click.echo(f"{output}: {opt.count_noun(bag.messages, 'message')}")
         for damage in bag.damaged:
             click.echo(f"lost: {damage}", err=True)
         return
@@ -229,7 +220,7 @@ FEWEST = 2
 def compare(
     runs: Annotated[list[Path], argument("Runs' folders, or their logs; two or more.")],
     output: Annotated[Path | None, output_option("Write the picture here (png, svg, pdf).")] = None,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Compare runs side by side: a column for each in a table, and a picture with -o."""
     from rich import box
@@ -242,7 +233,7 @@ def compare(
     from teamslam.team.recording.reader import open_log
 
     if len(runs) < FEWEST:
-        fail("one run alone is compared with nothing: give two or more", WRONG_USE)
+        refuse("one run alone is compared with nothing: give two or more")
     if output is not None:
         _check_picture(output)
     evaluated = {}
@@ -251,7 +242,7 @@ def compare(
         while name in evaluated:
             name += "'"
         opened = open_log(path)
-        warn_of_holes(opened)
+        opt.warn_of_holes(opened)
         evaluated[name] = evaluate(opened.samples())
     table = Table(box=box.SIMPLE)
     table.add_column("", no_wrap=True)
@@ -262,13 +253,13 @@ def compare(
     Console().print(table)
     if output is not None and compare_picture(evaluated, output):
         click.echo(f"wrote {output}")
-    write_json(json_file, compare_figures(evaluated))
+    opt.write_json(json_file, compare_figures(evaluated))
 
 
 def _check_picture(path: Path) -> None:
     forms = [form.value for form in Form]
     if path.suffix.removeprefix(".") not in forms:
         names = ", ".join(f".{form}" for form in forms)
-        fail(f"-o {path}: a picture's name ends in one of {names}", WRONG_USE)
+        refuse(f"-o {path}: a picture's name ends in one of {names}")
     if not path.parent.is_dir():
-        fail(f"-o {path}: there is no folder {path.parent}; make it first", WRONG_USE)
+        refuse(f"-o {path}: there is no folder {path.parent}; make it first")

@@ -10,25 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from teamslam.sim.cli.commands import Group, argument, option, output_option
-from teamslam.sim.cli.options import (
-    FAILED,
-    WRONG_USE,
-    EstimatorOption,
-    FusionOption,
-    JsonFile,
-    Localise,
-    LogArgument,
-    MapFiles,
-    check_folder,
-    check_localises,
-    fail,
-    failing,
-    saved_maps,
-    set_aside,
-    warn_of_holes,
-    write_json,
-)
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import Group, argument, fail, failing, option, output_option, refuse
 from teamslam.sim.cli.results import Steps, print_written, read_run
 
 if TYPE_CHECKING:
@@ -64,8 +47,8 @@ def rerun(
     seed: Annotated[
         int | None, option("Seed of the estimators and of the losses.", "N", least=0)
     ] = None,
-    map_: MapFiles = None,
-    localise: Localise = False,
+    map_: opt.MapFiles = None,
+    localise: opt.Localise = False,
     noise: Annotated[
         list[str] | None,
         option(
@@ -96,9 +79,9 @@ def rerun(
             section=NETWORK_CHANGES,
         ),
     ] = None,
-    fusion: FusionOption = None,
-    estimator: EstimatorOption = None,
-    json_file: JsonFile = None,
+    fusion: opt.FusionOption = None,
+    estimator: opt.EstimatorOption = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Recompute a log, to verify it or to compare it under other conditions.
 
@@ -111,9 +94,9 @@ def rerun(
     """
     from teamslam.sim.recorded.changed_run import Changes
 
-    saved_maps(map_)
+    opt.saved_maps(map_)
     if localise:
-        check_localises(map_)
+        opt.check_localises(map_)
     changes = Changes(
         without=tuple(without or ()),
         fusion=fusion,
@@ -130,24 +113,24 @@ def rerun(
         localise=localise,
     )
     if output is not None:
-        check_folder(output)
+        opt.check_folder(output)
     if not verify:
         _compare(log, changes, json_file, output)
     elif changes == Changes():
         _verify(log, json_file)
     else:
-        fail("--verify compares with the log as it is: leave the changes away", WRONG_USE)
+        refuse("--verify compares with the log as it is: leave the changes away")
 
 
 def _positive(value: float | None, option: str) -> float | None:
     if value is not None and not (value > 0.0 and math.isfinite(value)):
-        fail(f"{option} {value}: give a positive number", WRONG_USE)
+        refuse(f"{option} {value}: give a positive number")
     return value
 
 
 def _probability(loss: float) -> float:
     if not 0.0 <= loss < 1.0:
-        fail(f"--loss {loss}: give a probability from 0 to below 1", WRONG_USE)
+        refuse(f"--loss {loss}: give a probability from 0 to below 1")
     return loss
 
 
@@ -157,16 +140,14 @@ def _span(text: str, option: str) -> tuple[float, float]:
     except ValueError:
         begin, end = math.nan, math.nan
     if not 0.0 <= begin < end < math.inf:
-        fail(
-            f"{option} {text}: give seconds since the log's first measurement, as 60-120", WRONG_USE
-        )
+        refuse(f"{option} {text}: give seconds since the log's first measurement, as 60-120")
     return begin, end
 
 
 def _partition(text: str) -> tuple[tuple[str, ...], tuple[float, float]]:
     robots, colon, span = text.partition(":")
     if not (robots and colon):
-        fail(f"--partition {text}: give robots and seconds, as r1,r2:100-200", WRONG_USE)
+        refuse(f"--partition {text}: give robots and seconds, as r1,r2:100-200")
     return tuple(robots.split(",")), _span(span, "--partition")
 
 
@@ -181,12 +162,11 @@ def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
         except ValueError:
             factor = math.nan
         if kind not in KINDS or not 0.0 < factor < math.inf:
-            fail(
-                f"--noise {text}: give one of {', '.join(KINDS)} and a factor above 0, as range=2",
-                WRONG_USE,
+            refuse(
+                f"--noise {text}: give one of {', '.join(KINDS)} and a factor above 0, as range=2"
             )
         if kind in factors:
-            fail(f"--noise {text}: {kind} is given twice", WRONG_USE)
+            refuse(f"--noise {text}: {kind} is given twice")
         factors[kind] = factor
     return tuple(factors.items())
 
@@ -214,9 +194,9 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     with readable(path) as source:
         log = log_or_run(source)
     if isinstance(log, Log):
-        warn_of_holes(log)
+        opt.warn_of_holes(log)
     recorded = evaluate(log.samples())
-    with failing(FAILED, RerunError, at=path):
+    with failing(RerunError, at=path):
         plain = isinstance(log, DataSetRun) and changes == Changes()
         computed = list(log.samples()) if plain else changed_run(log, changes)
         changed = recorded if plain else evaluate(computed)
@@ -241,20 +221,19 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         "recorded": to_json(recorded),
         "recomputed": to_json(changed),
     }
-    write_json(json_file, figures)
+    opt.write_json(json_file, figures)
     if output is not None:
         _write_run(computed, changed, output, console)
         if not plain and draw_maps(runs, output / "maps.png"):
             console.print(f"wrote {output / 'maps.png'}", highlight=False, soft_wrap=True)
     if changed.map is None:
-        fail("the changed run ended without a final map", FAILED)
+        fail("the changed run ended without a final map")
     if failures := changed.failures:
-        fail("; ".join(failures), FAILED)
+        fail("; ".join(failures))
     if isinstance(log, Log) and not log.complete:
         fail(
             f"{log.path} is cut, so the result is of the part before the cut: `teamslam repair "
-            f"{log.path} -o FIXED.mcap` completes the log",
-            FAILED,
+            f"{log.path} -o FIXED.mcap` completes the log"
         )
 
 
@@ -272,7 +251,7 @@ def _write_run(
     assert evaluation.scenario is not None
     log = folder / IN_FOLDER
     if log.exists():
-        set_aside(log)
+        opt.set_aside(log)
     with Recorder(log, evaluation.scenario.team, provenance()) as recorder:
         recorder.write(computed)
     steps = Steps()
@@ -298,21 +277,21 @@ def _verify(path: Path, json_file: Path | None) -> None:
     from teamslam.team.recording.reader import open_log
 
     log = open_log(path)
-    warn_of_holes(log)
+    opt.warn_of_holes(log)
     began = time.monotonic()
-    with failing(FAILED, RerunError, at=path):
+    with failing(RerunError, at=path):
         result = verify(log, _processes())
     elapsed_s = time.monotonic() - began
     _print_verification(result, elapsed_s)
     figures = asdict(result) | {"elapsed_s": elapsed_s, "equal": result.first is None}
-    write_json(json_file, figures)
+    opt.write_json(json_file, figures)
     if not log.complete:
         click.echo(f"{path} is cut: its last messages may lack their inputs", err=True)
     if not result.messages:
-        fail(f"{path} has no message that can be computed again: nothing is verified", FAILED)
+        fail(f"{path} has no message that can be computed again: nothing is verified")
     if result.first is not None:
         what = "the log lacks what is needed" if result.first.lacks else "the first difference"
-        fail(f"{what}: {result.first}", FAILED)
+        fail(f"{what}: {result.first}")
 
 
 def _processes() -> int:
@@ -362,11 +341,11 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
 
 @app.declare("teamslam verify-ledger runs/first --list", name="verify-ledger")
 def verify_ledger(
-    log: LogArgument,
+    log: opt.LogArgument,
     lists: Annotated[
         bool, option("List each rejected measurement with its reason.", "--list")
     ] = False,
-    json_file: JsonFile = None,
+    json_file: opt.JsonFile = None,
 ) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
     from rich.console import Console
@@ -383,8 +362,8 @@ def verify_ledger(
     from teamslam.team.recording.reader import open_log
 
     opened = open_log(log)
-    warn_of_holes(opened)
-    with failing(FAILED, RerunError, at=log):
+    opt.warn_of_holes(opened)
+    with failing(RerunError, at=log):
         found = ledger(index_log(opened))
     robots = in_order({robot for robot, _ in found.entries})
     console = Console()
@@ -400,9 +379,9 @@ def verify_ledger(
         console.print("--list shows each rejected measurement with its reason", highlight=False)
     if not opened.complete:
         click.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
-    write_json(json_file, found.to_json())
+    opt.write_json(json_file, found.to_json())
     for offender in found.offenders[:OFFENDERS]:
         click.secho(offender, fg="red", err=True)
     if found.offenders:
-        fail(f"{len(found.offenders)} violations of the ledger", FAILED)
+        fail(f"{len(found.offenders)} violations of the ledger")
     console.print(found.statement(), highlight=False, soft_wrap=True)

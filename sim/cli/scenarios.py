@@ -9,17 +9,8 @@ from typing import Annotated
 
 import click
 
-from teamslam.sim.cli.commands import Group, option, output_option
-from teamslam.sim.cli.options import (
-    WRONG_USE,
-    IdentitiesOption,
-    Robots,
-    ScenarioArgument,
-    Seed,
-    count_noun,
-    fail,
-    scenario_of,
-)
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import Group, option, output_option, refuse
 from teamslam.sim.scenarios.document import builtin_text
 from teamslam.sim.scenarios.scenario import builtin_names, load, with_options
 
@@ -36,12 +27,12 @@ def scenarios(
     if show is not None:
         if show not in builtin_names():
             known = ", ".join(builtin_names())
-            fail(f"--show {show}: no built-in scenario; known: {known}", WRONG_USE)
+            refuse(f"--show {show}: no built-in scenario; known: {known}")
         click.echo(builtin_text(show), nl=False)
         return
     width = shutil.get_terminal_size().columns
     for name in builtin_names():
-        team = count_noun(len(load(name).robots), "robot")
+        team = opt.count_noun(len(load(name).robots), "robot")
         start = f"{name:14} {team:10} "
         click.echo(start + textwrap.shorten(_summary(name), width - len(start), placeholder=" …"))
 
@@ -57,11 +48,11 @@ def _summary(name: str) -> str:
 
 @app.declare("teamslam simulate waypoints -o my_world")
 def simulate(
-    scenario: ScenarioArgument,
+    scenario: opt.ScenarioArgument,
     output: Annotated[Path, output_option("Folder for the data set.")],
-    robots: Robots = None,
-    seed: Seed = None,
-    identities: IdentitiesOption = None,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    identities: opt.IdentitiesOption = None,
 ) -> None:
     """Write a scenario's world as a data set, with a scenario that runs it.
 
@@ -75,8 +66,10 @@ def simulate(
     from teamslam.sim.scenarios.toml import data_set_scenario, folder_scenario
 
     if output.exists() and any(output.iterdir()):
-        fail(f"{output} is not empty: give a new folder", WRONG_USE)
-    resolved = with_options(scenario_of(scenario), robots=robots, seed=seed, identities=identities)
+        refuse(f"{output} is not empty: give a new folder")
+    resolved = with_options(
+        opt.scenario_of(scenario), robots=robots, seed=seed, identities=identities
+    )
     streams = streams_of(resolved)
     tables = bool(beyond_utias(streams))
     (write_folder if tables else write_utias)(streams, output)

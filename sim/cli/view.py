@@ -12,21 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from teamslam.sim.cli.commands import Group, option, rare
-from teamslam.sim.cli.options import (
-    FAILED,
-    LOOPBACK,
-    WRONG_USE,
-    Connect,
-    Keys,
-    LogArgument,
-    ScenarioArgument,
-    connect_bus,
-    fail,
-    refuse_existing,
-    scenario_of,
-    warn_of_holes,
-)
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import Group, fail, option, rare, refuse
 from teamslam.sim.cli.results import Steps
 from teamslam.team.extras import install_command
 
@@ -53,7 +40,9 @@ app = Group()
 
 
 @app.declare("teamslam viewer waypoints")
-def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys = None) -> None:
+def viewer(
+    scenario: opt.ScenarioArgument, connect: opt.Connect = opt.LOOPBACK, keys: opt.Keys = None
+) -> None:
     """Publish views for Foxglove, Lichtblick and Rerun, once a second of team time.
 
     The recorder stores them beside the team's messages. Ends after the final map.
@@ -61,10 +50,10 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
     from teamslam.central.desk.view.export import run_viewer
     from teamslam.team.shell import process
 
-    resolved = scenario_of(scenario)
+    resolved = opt.scenario_of(scenario)
     with (
         process("viewer", endless=True) as stop,
-        connect_bus(resolved.team, connect, keys, "viewer", stop) as bus,
+        opt.connect_bus(resolved.team, connect, keys, "viewer", stop) as bus,
     ):
         _LOG.info("connected to team %s at %s", resolved.team, connect)
         peers = [each.id for each in resolved.robots] if resolved.peers else []
@@ -73,7 +62,7 @@ def viewer(scenario: ScenarioArgument, connect: Connect = LOOPBACK, keys: Keys =
 
 @app.declare("teamslam view runs/first")
 def view(
-    log: LogArgument,
+    log: opt.LogArgument,
     port: Port = 0,
     foxglove_port: FoxglovePort = None,
     host: Annotated[
@@ -111,19 +100,19 @@ def view(
     if not follow or log.exists():
         opened = open_log(log)
         if not follow:
-            warn_of_holes(opened)
+            opt.warn_of_holes(opened)
         if export is not None or layout is not None:
             _write(opened, export, layout)
             return
     elif export is not None or layout is not None:
-        fail(f"{log}: not found; --export and --layout need a log", WRONG_USE)
+        refuse(f"{log}: not found; --export and --layout need a log")
     with (
         process("view", endless=True) as stop,
         show_on_page(log, host, port, foxglove_port, browser, growing=follow) as shown,
     ):
         stop.wait()
         if shown.feed.error is not None:
-            fail(shown.feed.error, WRONG_USE)
+            refuse(shown.feed.error)
 
 
 @contextmanager
@@ -141,7 +130,7 @@ def show_on_page(
 
     has_sdk = find_spec("foxglove") is not None
     if foxglove_port is not None and not has_sdk:
-        fail(f"--foxglove-port needs Foxglove's SDK: {install_command('foxglove')}", WRONG_USE)
+        refuse(f"--foxglove-port needs Foxglove's SDK: {install_command('foxglove')}")
     note = ""
     if foxglove_port is None and has_sdk:
         foxglove_port = free_port(host, FOXGLOVE_PORT)
@@ -173,16 +162,16 @@ def _write_video(log: Path, path: Path) -> None:
     from teamslam.team.wire.messages import FusedMap
 
     if path.suffix != ".gif" or not path.parent.is_dir():
-        fail(f"--export-video {path}: give a .gif in an existing folder", WRONG_USE)
+        refuse(f"--export-video {path}: give a .gif in an existing folder")
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
-    warn_of_holes(opened)
+    opt.warn_of_holes(opened)
     steps.begin("reading the run")
     maps = (decoded(s.payload, FusedMap) for s in opened.samples((FUSED_MAP, FINAL_MAP)))
     evaluation, drawn = evaluate(opened.samples()), maps_over_time(maps)
     steps.begin("drawing the film")
     if not draw_film(evaluation, drawn, path, steps.share):
-        fail(f"{log} has no final map or no poses to draw", FAILED)
+        fail(f"{log} has no final map or no poses to draw")
     click.echo(f"wrote {path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
@@ -193,7 +182,7 @@ def _write(log: "Log", export: Path | None, layout: Path | None) -> None:
 
     for path in (export, layout):
         if path is not None:
-            refuse_existing(path)
+            opt.refuse_existing(path)
     if export is not None:
         click.echo(f"{export}: {export_views(log, export)}")
     if layout is not None:

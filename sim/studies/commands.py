@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import click
 
-from teamslam.sim.cli.commands import Group, argument, option
-from teamslam.sim.cli.options import FAILED, failing, warn_of_holes, write_json
+from teamslam.sim.cli import options as opt
+from teamslam.sim.cli.commands import Group, argument, failing, option
 
 Noise = Annotated[
     Literal["white", "profile"],
@@ -37,9 +37,9 @@ def batch_reference(
     with readable(log) as source:
         run = log_or_run(source)
     if isinstance(run, Log):
-        warn_of_holes(run)
-    with failing(FAILED, BatchReferenceError):
+        opt.warn_of_holes(run)
+    with failing(BatchReferenceError):
         result = batch_map(run.samples(), noise)
     figures = result.to_json()
     click.echo(json.dumps(figures, indent=2))
-    write_json(json_file, figures)
+    opt.write_json(json_file, figures)

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from teamslam.sim.cli.commands import Group, argument, option
-from teamslam.sim.cli.options import FAILED, WRONG_USE, fail, failing
+from teamslam.sim.cli.commands import Group, argument, fail, option, refuse, refusing
 from teamslam.sim.studies.experiments.catalogue import ENTRIES, Entry, Study
 from teamslam.team.extras import install_command
 
@@ -89,13 +88,13 @@ def merge(
     )
     from teamslam.sim.studies.experiments.runner import tasks_by_name
 
-    with failing(WRONG_USE, ShardError):
+    with refusing(ShardError):
         study, program = study_of(shards)
     if dataset:
         study = replace(study, datasets=[str(path) for path in dataset])
     tasks = tasks_by_name(_plans(study))
     if programs_of(list(tasks.values())) != program:
-        fail("the shards were computed by another version of the program or libraries", WRONG_USE)
+        refuse("the shards were computed by another version of the program or libraries")
     collect_results(shards, output)
     _run(study, output, jobs, json_file, check=check)
 
@@ -124,7 +123,7 @@ def _require_joblib() -> None:
     try:
         import joblib  # noqa: F401 - reported before the work, not after it
     except ModuleNotFoundError:
-        fail(f"experiments need joblib: {install_command('studies')}", WRONG_USE)
+        refuse(f"experiments need joblib: {install_command('studies')}")
 
 
 @contextmanager
@@ -132,7 +131,7 @@ def _stoppable(output: Path) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        fail(f"interrupted; results so far are in {output}: repeat the command to continue", FAILED)
+        fail(f"interrupted; results so far are in {output}: repeat the command to continue")
 
 
 def _run_shard(study: Study, text: str, output: Path, jobs: int | None) -> None:
@@ -149,11 +148,11 @@ def _run_shard(study: Study, text: str, output: Path, jobs: int | None) -> None:
     from teamslam.sim.studies.experiments.output import show_progress
     from teamslam.sim.studies.experiments.runner import FAILURES, compute_runs, cores, tasks_by_name
 
-    with failing(WRONG_USE, ShardError):
+    with refusing(ShardError):
         shard = parsed_shard(text)
     tasks = tasks_by_name(_plans(study))
     if not tasks:
-        fail(without_datasets(study.experiment), WRONG_USE)
+        refuse(without_datasets(study.experiment))
     part = tasks_of(tasks, shard)
     with _stoppable(output):
         _, failed = compute_runs(part, output, jobs or cores(), show_progress)
@@ -164,7 +163,7 @@ def _run_shard(study: Study, text: str, output: Path, jobs: int | None) -> None:
         "teamslam experiment merge FOLDER… -o DIR"
     )
     if failed:
-        fail(f"{len(failed)} runs failed; {output / FAILURES} has their tracebacks", FAILED)
+        fail(f"{len(failed)} runs failed; {output / FAILURES} has their tracebacks")
 
 
 def _run(
@@ -188,10 +187,10 @@ def _run(
 
     name = study.experiment
     if json_file is not None and not json_file.absolute().parent.is_dir():
-        fail(f"--json {json_file}: no such folder; make it first", WRONG_USE)
+        refuse(f"--json {json_file}: no such folder; make it first")
     plans = _plans(study)
     if not any(plan.tasks for plan in plans):
-        fail(without_datasets(name), WRONG_USE)
+        refuse(without_datasets(name))
     with _stoppable(output):
         concluded = compute_outcomes(plans, output, jobs or cores(), show_progress)
     origin = provenance()
@@ -208,10 +207,10 @@ def _run(
     click.echo(f"{page}: results with pictures; JSON and PNG files beside it")
     failed = sum(len(each.failed) for each in concluded)
     if failed:
-        fail(f"{failed} runs failed; {output / FAILURES} has their tracebacks", FAILED)
+        fail(f"{failed} runs failed; {output / FAILURES} has their tracebacks")
     missed = sum(goal.passed is False for each in concluded for goal in each.outcome.goals)
     if check and missed:
-        fail(f"{missed} goals were missed", FAILED)
+        fail(f"{missed} goals were missed")
 
 
 for _entry in ENTRIES:

@@ -146,7 +146,7 @@ def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgeme
     thread = threading.Thread(target=centre, daemon=True)
     thread.start()
     monkeypatch.setattr(
-        "teamslam.sim.cli.orders.connect_bus", lambda *_: nullcontext(MemoryBus(network))
+        "teamslam.sim.cli.options.connect_bus", lambda *_: nullcontext(MemoryBus(network))
     )
     try:
         return CliRunner().invoke(app, ["verdict", *words, "--team", "t"])

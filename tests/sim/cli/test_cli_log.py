@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from teamslam.sim.cli.commands import WRONG_USE
 from teamslam.sim.cli.main import app
-from teamslam.sim.cli.options import WRONG_USE
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.team.recording.check import NO_FINAL

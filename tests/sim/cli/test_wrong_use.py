@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from teamslam.sim.cli.commands import WRONG_USE
 from teamslam.sim.cli.main import main
-from teamslam.sim.cli.options import WRONG_USE
 from tests.support import ROOT
 
 
