@@ -9,10 +9,9 @@ from pathlib import Path
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import make_centre
-from teamslam.team.missing_measurements import MissingMeasurements
 from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.set_file import SetFile
-from teamslam.team.shell import WAIT_S, Shell
+from teamslam.team.shell import WAIT_S, MissingMeasurements, Shell, select_due
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
@@ -212,15 +211,9 @@ class CentralShell:
         for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
             self._bus.request(ch.SENT, robot, m.SubmapsRequest(stamp_ns=0, robot=robot))
         self._greeted |= robots.intersection(self.node.robots)
-        requested = {(each.robot, each.incarnation): each for each in self.node.lacking()}
-        firsts = {stream: each.first for stream, each in requested.items()}
-        for stream in self._request_times.due(firsts, time.monotonic()):
-            _LOG.warning(
-                "submaps of %s from %d on are missing: asked for",
-                stream[0],
-                requested[stream].first,
-            )
-            self._bus.request(ch.SENT, stream[0], requested[stream])
+        for each in select_due(self.node.lacking(), self._request_times):
+            _LOG.warning("submaps of %s from %d on are missing: asked for", each.robot, each.first)
+            self._bus.request(ch.SENT, each.robot, each)
 
     def _leave_last(self) -> None:
         """Wait until all have left, to answer requests for the final map."""

@@ -14,8 +14,8 @@ Few = Annotated[int, Meta(ge=1, le=1000)]
 class AssociationProfile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Thresholds for merging landmarks without identities; lengths in metres.
 
-    LLR: log-likelihood ratio of one landmark against two. Thresholds without a derivation are
-    empirical (docs/notes/association-with-undo.md).
+    LLR: log-likelihood ratio of one landmark against two. Derivations:
+    docs/notes/association-with-undo.md.
     """
 
     gate: Positive = GATE

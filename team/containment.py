@@ -1,7 +1,7 @@
-"""The fault boundary around a node sets messages aside whose handling raises.
+"""The fault boundary around a node: a message whose handling raises is set aside.
 
-Such a message is published as `Fault`, counted, and ignored when it is delivered again; the node
-continues with the messages of its `set_aside`. An interrupt or an exit ends the process.
+It is published as `Fault`, counted, and ignored when it is delivered again. An interrupt or an exit
+ends the process.
 """
 
 import hashlib
@@ -30,9 +30,8 @@ _OURS = ("teamslam.",)
 class Handler(Protocol):
     """A handler of messages, with optional methods.
 
-    refusal(message): the reason to refuse a message, or None. handle_sample(message, sample): in
-    place of `handle`, to forward the encoded bytes. set_aside(message, why): the messages that
-    replace the answer after an exception, such as the sender's credit.
+    refusal(message): why to refuse it, or None. handle_sample(message, sample): in place of
+    `handle`. set_aside(message, why): the messages that replace the answer after an exception.
     """
 
     def handle(self, message: m.Message) -> list[Outgoing]:
@@ -41,10 +40,7 @@ class Handler(Protocol):
 
 @dataclass
 class Boundary:
-    """Pass messages to one node, and count refused messages and exceptions.
-
-    aside: messages that are not handled again, by key and digest.
-    """
+    """Pass messages to one node; aside: key and digest of those not handled again."""
 
     name: str
     faults: int = 0
@@ -59,7 +55,7 @@ class Boundary:
         return message if isinstance(message, list) else self.hand(node, message, sample)
 
     def let_in(self, sample: Sample, open_: Callable[[], M]) -> M | list[Outgoing]:
-        """Decode a sample; return its message, or the messages to publish if it is invalid."""
+        """Decode a sample; return the messages to publish if it is invalid."""
         try:
             return open_()
         except WireError as error:
@@ -71,10 +67,7 @@ class Boundary:
     def hand(
         self, node: Handler, message: m.Message, sample: Sample | None = None
     ) -> list[Outgoing]:
-        """Let the node handle a message; return the answers, or the fault and the replacement.
-
-        sample: the message as it arrived; None: encode it if needed.
-        """
+        """Let the node handle a message; return the answers, or the fault and the replacement."""
         if self.aside and _name(sample or sample_of(message)) in self.aside:
             return []
         try:
@@ -144,7 +137,7 @@ class Boundary:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Numbers of refused messages and faults, in words, for the status."""
+        """Numbers of refused messages and faults, in words."""
         dropped = f"{self.refused} dropped at the door, the last: {self.last_refused}"
         raised = f"{self.faults} set aside after a fault, the last: {self.last}"
         return (*([dropped] if self.refused else ()), *([raised] if self.faults else ()))
@@ -165,7 +158,7 @@ def reply_of(payload: bytes, expected: type[M]) -> M:
 
 
 def place_of(trace: TracebackType | None) -> str:
-    """Return module:function:line of the innermost frame of our packages, else of all frames."""
+    """Return module:function:line of the innermost frame of our packages, else of all."""
     frames = [(f.f_globals.get("__name__", "?"), f.f_code.co_qualname, line)
               for f, line in traceback.walk_tb(trace)]  # fmt: skip
     ours = [frame for frame in frames if f"{frame[0]}.".startswith(_OURS)]

@@ -1,9 +1,9 @@
-"""Refuse messages that are valid but contradict the team: strangers, impossible counters, stamps.
+"""Refuse messages that contradict the team: strangers, impossible counters, stamps.
 
-The bounds are so wide that no order of arrival makes a true message fail.
+No order of arrival makes a true message fail.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 from teamslam.team.config import MAP
 from teamslam.team.wire import messages as m
@@ -20,6 +20,15 @@ OF_ROBOTS = (
     m.Innovation, m.Association, m.StreamHead,
 )  # fmt: skip
 """Messages of a stream, with robot and incarnation."""
+COUNTERS: Mapping[type[m.Message], tuple[str, ...]] = {
+    m.Submap: ("sequence", "last_measurement", "sightings"),
+    m.SightingFactor: ("sequence",),
+    m.Progress: ("measurements", "submaps"),
+    m.StreamHead: ("measurements",),
+    m.Done: ("measurements", "submaps", "steps"),
+    m.MapEstimate: ("sequence", "exchange"),
+}
+"""Fields of messages that are bounded by MOST_COUNT."""
 
 
 class Door:
@@ -34,7 +43,7 @@ class Door:
         self._robots |= {robot}
 
     def refusal(self, message: m.Message) -> str | None:
-        """Return the reason to refuse a message; None: accepted."""
+        """Return the reason to refuse a message."""
         strangers = sorted(set(_robots(message)) - self._robots)
         if strangers:
             return f"of {', '.join(strangers)}, not in this team"
@@ -44,9 +53,7 @@ class Door:
         return refused or self._another_time(message)
 
     def _note_beginning(self, start: m.InitialPose) -> None:
-        """Store a stream's start time; two contradicting ones, one of them forged, remove its
-        bounds.
-        """
+        """Store a stream's start time; two contradicting ones remove its bounds."""
         stream = (start.robot, start.incarnation)
         known = self._began.setdefault(stream, start.stamp_ns)
         if known is not None and another_time(start.stamp_ns, known) is not None:
@@ -60,7 +67,7 @@ class Door:
 
 
 def another_time(stamp_ns: int, began_ns: int) -> str | None:
-    """Return the reason to refuse a stamp of a stream that began at this time; None: accepted."""
+    """Return the reason to refuse a stamp of a stream that began at this time."""
     after_ns = stamp_ns - began_ns
     if -EARLY_NS <= after_ns <= LATE_NS:
         return None
@@ -68,14 +75,17 @@ def another_time(stamp_ns: int, began_ns: int) -> str | None:
 
 
 def absurd(message: m.Message) -> str | None:
-    """Return the reason to refuse a message with an unreachable count; None: accepted."""
+    """Return the reason to refuse a message with an unreachable count."""
     if (
         m.is_measurement(message)  # most messages are
         and message.incarnation <= MOST_LIVES
         and message.number <= MOST_COUNT
     ):
         return None
-    for incarnation in _lives(message):
+    lives = [message.incarnation] if isinstance(message, OF_ROBOTS) else []
+    if isinstance(message, m.End):
+        lives = [stream.incarnation for stream in message.streams]
+    for incarnation in lives:
         if incarnation > MOST_LIVES:
             return f"of incarnation {incarnation}; no stream has more than {MOST_LIVES}"
     for count in _counts(message):
@@ -100,30 +110,12 @@ def _robots(message: m.Message) -> Iterator[str]:
             yield message.robot
 
 
-def _lives(message: m.Message) -> Iterator[int]:
-    if isinstance(message, m.End):
-        yield from (stream.incarnation for stream in message.streams)
-    elif isinstance(message, OF_ROBOTS):
-        yield message.incarnation
-
-
 def _counts(message: m.Message) -> Iterator[int]:
-    match message:
-        case m.Measurement():
-            yield message.number
-        case m.Submap():
-            yield from (message.sequence, message.last_measurement, message.sightings)
-        case m.SightingFactor():
-            yield from (message.sequence, *message.measurements)
-        case m.Progress():
-            yield from (message.measurements, message.submaps)
-        case m.StreamHead():
-            yield message.measurements
-        case m.Done():
-            yield from (message.measurements, message.submaps, message.steps)
-        case m.MapEstimate():
-            yield from (message.sequence, message.exchange)
-        case m.End():
-            yield from (stream.measurements for stream in message.streams)
-        case _:
-            pass
+    if m.is_measurement(message):
+        yield message.number
+    elif isinstance(message, m.End):
+        yield from (stream.measurements for stream in message.streams)
+    else:
+        yield from (getattr(message, name) for name in COUNTERS.get(type(message), ()))
+    if isinstance(message, m.SightingFactor):
+        yield from message.measurements

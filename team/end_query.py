@@ -23,9 +23,8 @@ class EndQuery:
     """Query the router for the samples that end the team of this process.
 
     An end older than the process belongs to another run, unless SINCE is earlier, or an earlier
-    process of this node was in that run and left without a `Tally`. ends: channels on which the
-    team ends: the centre's final map, or, without a centre, each robot's own. robot: the robot of
-    interest on the robots' channels; "*": all.
+    process of this node was in that run and left without a `Tally`. ends: the centre's final map,
+    or, without a centre, each robot's own. robot: the robot of interest; "*": all.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class EndQuery:
         self._before_s = 0.0 if began is None else time.time() - 1e-9 * int(began)
 
     def find_missed(self) -> list[Sample]:
-        """Return the samples that end the team, as published; query every FINAL_S."""
+        """Return the samples that end the team; query every FINAL_S."""
         now = time.monotonic()
         if now < self._due:
             return []

@@ -49,10 +49,7 @@ def write_map(path: Path, saved: m.SavedMap) -> None:
 
 
 def submap_of(saved: m.SavedMap) -> m.Submap:
-    """Make the submap of a saved map: landmarks only, before the team's time.
-
-    All its unnamed landmarks count as seen at once: no two are one.
-    """
+    """Make the submap of a saved map: landmarks only, before the team's time, no two of them one."""
     n = 2 * len(ids(saved.ids, "ids"))
     submap = member_of(
         saved.author,
@@ -128,10 +125,8 @@ def map_name(text: str) -> str:
 
 
 def map_figures(saved: m.SavedMap) -> dict[str, Any]:
-    """Return figures of a saved map for people and JSON.
-
-    Provenance, the robots' own errors, and each landmark with its standard deviations, the shared
-    errors taken as zero.
+    """Figures of a saved map: provenance, the robots' own errors, and each landmark with its
+    standard deviations, the shared errors taken as zero.
     """
     numbers = ids(saved.ids, "ids").tolist()
     points = floats(saved.means, "means").reshape(-1, 2).tolist()

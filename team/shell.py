@@ -15,12 +15,32 @@ from typing import Protocol, TypeVar, runtime_checkable
 import msgspec
 
 from teamslam.team.config import MAP
-from teamslam.team.containment import Boundary
+from teamslam.team.containment import Boundary, reply_of
 from teamslam.team.end_query import EndQuery
 from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample, read_reply
-from teamslam.team.wire.channels import ALIVE, FAULT, FINAL_MAP, QUERIES, RECORDED, STATUS, Channel
+from teamslam.team.wire.channels import (
+    ALIVE,
+    FAULT,
+    FINAL_MAP,
+    MEASUREMENTS,
+    QUERIES,
+    RECORDED,
+    STATUS,
+    Channel,
+)
 from teamslam.team.wire.codec import WireError, decoded, encoded
-from teamslam.team.wire.messages import FusedMap, Liveliness, Message, Status, Tally, tag_of
+from teamslam.team.wire.messages import (
+    FusedMap,
+    Liveliness,
+    Measurement,
+    MeasurementsRequest,
+    Message,
+    Status,
+    SubmapsRequest,
+    Tally,
+    tag_of,
+)
+from teamslam.team.wire.request_times import RequestTimes
 
 FAILED_S = 10.0
 """Time [s] before work that raised an exception is tried again."""
@@ -29,7 +49,7 @@ FAILED_S = 10.0
 class SpareTime:
     """The wall-clock time at which the next piece of deferrable work may begin.
 
-    share: largest share of the time. took_s: duration of the last useful piece; None: none yet.
+    took_s: duration of the last useful piece.
     """
 
     def __init__(self, share: float) -> None:
@@ -43,14 +63,14 @@ class SpareTime:
         return max(0.0, self._next - time.monotonic())
 
     def note(self, began: float, *, useful: bool) -> None:
-        """Record a finished piece that began at this `time.monotonic`; useless ones are free."""
+        """Record a piece that began at this monotonic time; useless ones are free."""
         now = time.monotonic()
         if useful:
             self.took_s = now - began
             self._next = now + self._rest * self.took_s
 
     def note_failure(self) -> None:
-        """Record a piece that raised an exception."""
+        """Record a piece that raised."""
         self._next = time.monotonic() + FAILED_S
 
 
@@ -98,11 +118,10 @@ class FaultyRunError(RuntimeError):
 
 def judge(boundary: Boundary, final: FusedMap | None) -> None:
     """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
-    warnings = [*boundary.warnings] if boundary.faults else []
-    if final is not None and (lacks := describe_missing(final)):
-        warnings.append(lacks)
-    if warnings:
-        raise FaultyRunError("; ".join(warnings))
+    warnings = boundary.warnings if boundary.faults else ()
+    lacks = "" if final is None else describe_missing(final)
+    if warnings or lacks:
+        raise FaultyRunError("; ".join((*warnings, *([lacks] if lacks else ()))))
 
 
 def describe_missing(final: FusedMap) -> str:
@@ -118,11 +137,7 @@ def describe_missing(final: FusedMap) -> str:
 
 
 class Shell:
-    """Run one node on one bus; ends: channels on which the node's team ends.
-
-    A refused message is counted, logged and dropped. A message whose handling raises is set aside
-    (`teamslam.team.containment`).
-    """
+    """Run one node on one bus; ends: channels on which the node's team ends."""
 
     def __init__(
         self,
@@ -159,11 +174,11 @@ class Shell:
         self._stale = False
 
     def refresh_by(self, refresh: Callable[[], list[Outgoing]], share: float) -> None:
-        """Publish `refresh()` after input, while no more waits, for at most `share` of the time."""
+        """Publish `refresh()` after input, for at most `share` of the time."""
         self._refresh, self._spare_time = refresh, SpareTime(share)
 
     def receive(self) -> list[Sample]:
-        """Receive samples for WAIT_S; publish the refreshed result if none waits."""
+        """Receive samples for WAIT_S; publish a due refresh if none arrives."""
         refreshes = self._stale and self._refresh is not None
         wait_s = min(WAIT_S, self._spare_time.wait_s) if refreshes else WAIT_S
         samples = self.bus.receive(wait_s)
@@ -181,7 +196,7 @@ class Shell:
         return samples
 
     def begin(self) -> None:
-        """Publish the node's first messages and declare it alive; call it after subscribing."""
+        """Publish the first messages and declare the node alive, after subscribing."""
         self.publish(self.node.begin())
         self.bus.declare_alive(self._name)
         self._is_running = True
@@ -189,11 +204,11 @@ class Shell:
 
     @property
     def going(self) -> bool:
-        """Whether the node has not finished and no stop was requested."""
+        """Whether the node has neither finished nor to stop."""
         return not (self.node.finished or self._stop.is_set())
 
     def publish(self, out: Iterable[Outgoing]) -> None:
-        """Publish a node's messages in order, and send its requests; a failure is a fault."""
+        """Publish messages in order, and send requests; a failure is a fault."""
         for outgoing in out:
             try:
                 if outgoing.channel in QUERIES:
@@ -208,7 +223,7 @@ class Shell:
                     self.publish([fault])
 
     def take(self, samples: Iterable[Sample]) -> None:
-        """Decode samples, let the node handle them and publish its answers and status."""
+        """Decode and handle samples; publish answers and status."""
         for sample in samples:
             self._note_recorder(sample)
             self.publish(self.boundary.take(self.node, sample))
@@ -226,7 +241,7 @@ class Shell:
                 self.publish(self.boundary.take(self.node, sample))
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer queries; an exception is a fault and is reported to the sender of the query."""
+        """Answer queries; an exception is a fault, which the sender is told."""
 
         def contained(request: bytes) -> list[bytes]:
             try:
@@ -251,12 +266,12 @@ class Shell:
         return None
 
     def query_end(self) -> None:
-        """Query the router periodically for a missed end of the team."""
+        """Query the router for a missed end of the team."""
         if missed := self.end_query.find_missed():
             self.take_end(missed)
 
     def note(self, samples: Iterable[Sample]) -> None:
-        """Read the recorder's messages among these samples and ignore the others."""
+        """Read the recorder's messages among these samples."""
         for sample in samples:
             self._note_recorder(sample)
 
@@ -285,10 +300,10 @@ class Shell:
         self._lacking = lacking
 
     def wait_for_recorder(self, lacks: Callable[[], bool], take: Take | None = None) -> None:
-        """Wait until a recorder has reported all messages that this process published.
+        """Wait until a recorder has all messages of this process, or makes no progress for
+        RECORDER_S.
 
-        The wait ends if no recorder is present, or makes progress, for RECORDER_S. lacks: whether
-        the recorder lacks anything else. take: handles other samples meanwhile.
+        lacks: whether it lacks anything else. take: handles other samples meanwhile.
         """
         if self._recorder_is_there is None:
             return
@@ -330,7 +345,7 @@ class Shell:
         return f"it lacks {missing} messages on {len(keys)} keys, as {keys[0]}"
 
     def sample_of(self, out: Outgoing) -> Sample:
-        """Convert a message of this node to a sample as received from the bus."""
+        """Convert a message of this node to a received sample."""
         return Sample(out.key, encoded(out.message), out.message.stamp_ns, time.time_ns(), 0)
 
     def end(self, final: FusedMap | None) -> None:
@@ -338,7 +353,7 @@ class Shell:
         judge(self.boundary, final)
 
     def report(self, *, last: bool = False) -> None:
-        """Publish the node's status, at most every STATUS_S; the last one in any case."""
+        """Publish the node's status, at most every STATUS_S."""
         now = time.monotonic()
         if last or now >= self._status_due:
             self._status_due = now + STATUS_S
@@ -384,6 +399,57 @@ class Shell:
             self.contain("duty", duty)
             self.report()
         self.report(last=True)
+
+
+ASK_TIMEOUT_S = 10.0
+"""Longest time [s] for an answer; the request is repeated later."""
+R = TypeVar("R", MeasurementsRequest, SubmapsRequest)
+
+
+def select_due(requests: Iterable[R], times: RequestTimes[tuple[str, int]]) -> list[R]:
+    """Select the requests that are due, one for each stream."""
+    by_stream = {(each.robot, each.incarnation): each for each in requests}
+    firsts = {stream: each.first for stream, each in by_stream.items()}
+    return [by_stream[stream] for stream in times.due(firsts, time.monotonic())]
+
+
+class MissingMeasurements:
+    """Request missing measurements for one node.
+
+    confirm: called with each measurement of an answer before the node handles it.
+    """
+
+    def __init__(
+        self, shell: Shell, confirm: Callable[[Measurement], None] = lambda _: None
+    ) -> None:
+        self._shell = shell
+        self._confirm = confirm
+        self._times: RequestTimes[tuple[str, int]] = RequestTimes()
+
+    def look(self, requests: Sequence[MeasurementsRequest]) -> None:
+        """Send the requests that are due."""
+        for each in select_due(requests, self._times):
+            _LOG.warning(
+                "measurements %d to %d of %s, incarnation %d, are missing: asked for",
+                each.first,
+                each.last,
+                each.robot,
+                each.incarnation,
+            )
+            self.ask(each)
+
+    def ask(self, request: MeasurementsRequest) -> int:
+        """Send one request; return the number of measurements received."""
+        try:
+            replies = self._shell.bus.ask(MEASUREMENTS, request.robot, request, ASK_TIMEOUT_S)
+        except BusError as error:
+            _LOG.warning("%s", error)
+            return 0
+        for reply in replies:
+            with suppress(WireError):  # the door counts it
+                self._confirm(reply_of(reply, Measurement))
+        self._shell.take_replies(MEASUREMENTS, request.robot, replies)
+        return len(replies)
 
 
 @contextmanager

@@ -1,9 +1,4 @@
-"""The team's set of submaps: a union, so duplicates and any order of arrival change nothing.
-
-A submap is complete when all inter-robot measurements that it announces are stored. Admission
-refuses a submap whose measurements overlap another's (law 1), or that differs from a stored one of
-the same name.
-"""
+"""The team's set of submaps: a union, so duplicates and any order of arrival change nothing."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,10 +17,10 @@ Stream = tuple[str, int]
 class StoredStream:
     """The members of one incarnation of a robot.
 
-    submaps: by sequence. sightings: inter-robot measurements by sequence, then by (stamp,
-    teammate). chain: the complete submaps from sequence 0 on, without a gap. used: the
-    (measurement, teammate) pairs in an inter-robot measurement. refused: sequences of refused
-    submaps, and of those with a refused inter-robot measurement.
+    sightings: inter-robot measurements by sequence, then by (stamp, teammate); a submap with all
+    that it announces is complete. chain: the complete submaps from sequence 0 on, without a gap.
+    used: the (measurement, teammate) pairs in an inter-robot measurement. refused: sequences of
+    refused members.
     """
 
     start: m.InitialPose | None = None
@@ -43,7 +38,7 @@ class StoredStream:
             self.chain.append(submap)
 
     def processed(self, count: int) -> int:
-        """Return `count`, or more if the next submap was refused: no later one enters the map."""
+        """Return `count`; if the next submap was refused, all."""
         if count not in self.refused:
             return count
         return max(*self.refused, *self.submaps, count) + 1
@@ -53,11 +48,12 @@ _EMPTY = StoredStream()
 
 
 class SubmapStore:
-    """The members of the team's set, each in one place.
+    """The members of the team's set. Refused are a submap whose measurements overlap another's (law
+    1), and a member that differs from a stored one of its name.
 
     chains: the submaps available to a map, of streams with an initial pose; they grow in place.
-    maps: saved maps, by name. withdrawals: the first order on each withdrawn robot. verdicts: those
-    in force, with their landmarks in order. refused: number of refused members.
+    withdrawals: the first order on each robot. verdicts: those in force, with their landmarks in
+    order.
     """
 
     def __init__(self) -> None:
@@ -73,7 +69,7 @@ class SubmapStore:
     # Admission.
 
     def add(self, message: m.Message) -> str | None:
-        """Add a member of any kind; return the reason if it is refused."""
+        """Add a member; return the reason if refused."""
         match message:
             case m.InitialPose():
                 self.add_start(message)
@@ -92,22 +88,22 @@ class SubmapStore:
         return None
 
     def add_start(self, start: m.InitialPose) -> None:
-        """Add the initial pose of a stream; a second one is ignored."""
+        """Add the initial pose of a stream, once."""
         key = start.robot, start.incarnation
         stream = self._stream(key)
         stream.start = stream.start or start
         self._note_chain(key)
 
     def add_submap(self, submap: m.Submap) -> str | None:
-        """Add a submap; return the reason if it is refused."""
+        """Add a submap; return the reason if refused."""
         return self._settle(submap, self._refusal_of_submap(submap))
 
     def add_sighting(self, sighting: m.SightingFactor) -> str | None:
-        """Add an inter-robot measurement; return the reason if it is refused."""
+        """Add an inter-robot measurement; return the reason if refused."""
         return self._settle(sighting, self._refusal_of_sighting(sighting))
 
     def add_verdict(self, verdict: m.Verdict) -> None:
-        """Add an operator's verdict that two unnamed landmarks are one or two, or revoke it."""
+        """Add or revoke an operator's verdict."""
         judgement = _in_order(verdict.judgement)
         if verdict.withdrawn:
             self._revoked.add(judgement)
@@ -116,10 +112,9 @@ class SubmapStore:
             self.verdicts.add(judgement)
 
     def add_map(self, saved: m.SavedMap) -> str | None:
-        """Add a saved map as a stream of one submap; return the reason if it is refused.
+        """Add a saved map as a stream of one submap; return the reason if refused.
 
-        Its start is unknown, or the origin if its frame is the survey's. Two maps with a stream in
-        common would count its measurements twice (law 1).
+        Its start is unknown, or the origin in the survey's frame.
         """
         for other in self.maps.values():
             if other.name != saved.name and {*other.sets} & {*saved.sets}:
@@ -143,7 +138,7 @@ class SubmapStore:
         return refused
 
     def refuse(self, member: m.Submap | m.SightingFactor) -> None:
-        """Mark the submap of a member as refused: it may never be in the map."""
+        """Mark the submap of a member as refused."""
         self.refused += 1
         self._stream((member.robot, member.incarnation)).refused.add(member.sequence)
 
@@ -167,7 +162,7 @@ class SubmapStore:
             self.chains[key] = stream.chain
 
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
-        """Store a submap, or return the reason to refuse it by the submaps nearest in sequence."""
+        """Store a submap, or return why not, by the submaps nearest in sequence."""
         key = submap.robot, submap.incarnation
         stream = self._stream(key)
         submaps = stream.submaps
@@ -219,7 +214,7 @@ class SubmapStore:
     # Contents.
 
     def chain(self, stream: Stream) -> Sequence[m.Submap]:
-        """Return the complete submaps of a stream from sequence 0 on; they grow with the set."""
+        """Return the complete submaps of a stream from sequence 0 on."""
         return self.streams.get(stream, _EMPTY).chain
 
     def start(self, stream: Stream) -> m.InitialPose:
@@ -230,7 +225,7 @@ class SubmapStore:
 
     @property
     def newcomers(self) -> set[Stream]:
-        """Streams that have begun at an unknown pose and have no submap yet."""
+        """Streams from an unknown pose without a submap yet."""
         return {
             key
             for key, stream in self.streams.items()
@@ -244,7 +239,7 @@ class SubmapStore:
         return [found[key] for key in sorted(found)]
 
     def acknowledged(self, stream: Stream) -> int:
-        """Count the submaps of a stream that its robot need not send again: stored or refused."""
+        """Count the submaps of a stream that are stored or refused."""
         found = self.streams.get(stream, _EMPTY)
         return found.processed(len(found.chain))
 
@@ -265,7 +260,7 @@ class SubmapStore:
 
     @property
     def judged(self) -> int:
-        """Number of verdicts and of revocations; it grows whenever `verdicts` changes."""
+        """Number of verdicts and revocations; it grows whenever `verdicts` changes."""
         return len(self.verdicts | self._revoked) + len(self._revoked)
 
     def missing(self) -> tuple[m.VersionEntry, ...]:
@@ -281,10 +276,7 @@ class SubmapStore:
         return tuple(gaps)
 
     def messages_of(self, robot: str) -> Iterator[m.Message]:
-        """Yield the messages from which a robot's next process continues, latest incarnation first.
-
-        These are the initial pose, the chain and the inter-robot measurements from it.
-        """
+        """Yield a robot's members for its next process, latest incarnation first."""
         for key in sorted((key for key in self.streams if key[0] == robot), reverse=True):
             stream = self.streams[key]
             if stream.chain and stream.start is not None:

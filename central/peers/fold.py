@@ -1,8 +1,6 @@
-"""A peer's own fold: a centre's node that receives the peer's set instead of messages.
+"""A peer's own fold: a centre's node that receives the peer's set.
 
-The same set gives a centre's maps, byte for byte. The fold restarts when a folded member changes or
-the set grows after the final map; for a changed member only when there is time or the set is
-complete.
+The fold restarts when a folded member changes or the set grows after the final map.
 """
 
 import hashlib
@@ -23,10 +21,7 @@ FoldWhen = Literal["always", "request", "end"]
 
 
 class PeerFold:
-    """Fold of the set of a `PeerNode`.
-
-    final: the newest of `finals` final maps.
-    """
+    """Fold of the set of a `PeerNode`; final: the newest of `finals` final maps."""
 
     def __init__(
         self,
@@ -78,7 +73,7 @@ class PeerFold:
         return self._give(m.End(stamp_ns=0, streams=tuple(streams)))
 
     def grow(self) -> list[Outgoing]:
-        """Fold the new members of the set; return the messages to publish."""
+        """Fold the new members of the set."""
         if self._waits:
             if not self._whole:
                 return []
@@ -104,7 +99,7 @@ class PeerFold:
         return out
 
     def ask(self) -> list[Outgoing]:
-        """Fold the present set without waiting; return the messages to publish."""
+        """Fold the present set on request."""
         if self._when == "end" and self._waits:
             return []
         waits, self._waits = self._waits, False

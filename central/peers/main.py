@@ -24,9 +24,9 @@ from teamslam.team.wire.bus import Bus, Outgoing, Tap
 
 
 class PeerCentre(Peer):
-    """The centre's peer: `begin`, then `handle_sample` and `tick`, until `finished`.
+    """The centre's peer, which folds the set without an estimator.
 
-    It folds the set without an estimator. No robot waits for it; it may join and leave at any time.
+    No robot waits for it; it may join and leave at any time.
     """
 
     def __init__(
@@ -78,10 +78,7 @@ class Alone:
 
 
 class PeerShell(RobotShell):
-    """Process of a robot without a centre.
-
-    store: file of its set; None: not stored.
-    """
+    """Process of a robot without a centre; store: file of its set."""
 
     def __init__(
         self,

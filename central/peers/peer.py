@@ -22,10 +22,9 @@ CENTRE = "central"
 class Peer:
     """The team's set at the node `name`, and its fold.
 
-    carried: forwarded members until they are logged. uplink, downlink: bytes of the set's channels.
-    world_alive: None before any message of a world. ended: robots whose end the router stores.
-    others: robots and centre that are present. unpublished: messages of a requested fold; newest:
-    its last map.
+    carried: forwarded members until they are logged. world_alive: None before any message of a
+    world. ended: robots whose end the router stores. others: present robots and centre.
+    unpublished: messages of a requested fold.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class Peer:
         return members
 
     def handle(self, message: m.Message) -> list[Outgoing]:
-        """Process a message without a key, such as a reply."""
+        """Process a message without a key."""
         return self.handle_sample(message, sample_of(message))
 
     def handle_sample(self, message: m.Message, sample: Sample) -> list[Outgoing]:
@@ -138,9 +137,7 @@ class Peer:
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether every other robot has announced its end or is given up or withdrawn, and no
-        present node has the missing members.
-        """
+        """Whether all others have ended, and no present node has the missing members."""
         stated = self.peer.replica.statements
         others = {
             robot
@@ -151,7 +148,7 @@ class Peer:
         return bool(others) and others <= self.ended and self.final is None and not self.others
 
     def take_end(self, samples: Sequence[Sample]) -> None:
-        """Note the ends of robots that the router stores, each by the robot itself."""
+        """Note the ends of robots that the router stores."""
         for _, robot, message in open_valid(samples):
             if isinstance(message, m.Concluded):
                 self.ended.add(robot)
@@ -170,7 +167,7 @@ class Peer:
         return [*unpublished, *self.counted(self.peer.tick(now_s))]
 
     def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
-        """Count the messages of the set's channels; return all."""
+        """Count the messages of the set's channels."""
         talk = (
             each.message
             for each in out
@@ -180,7 +177,7 @@ class Peer:
         return list(out)
 
     def grown(self) -> list[Outgoing]:
-        """Fold the new members of the set; return the fold's messages."""
+        """Fold the new members of the set."""
         return self._from_fold(self.fold.grow())
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
@@ -206,7 +203,7 @@ class Peer:
         return [] if self.newest is None else [encoded(self.newest)]
 
     def set_figures(self) -> dict[str, float]:
-        """Figures of the set: size, newest submap by robot, sources, peers with the same set."""
+        """Figures of the set's size, sources and agreement."""
         replica = self.peer.replica
         figures = {
             "set_submaps": float(replica.submaps),

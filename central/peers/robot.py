@@ -31,7 +31,7 @@ _OF_A_CENTRE = (ch.PRIOR, ch.FUSED_MAP, ch.FINAL_MAP, ch.CENTRAL_PROGRESS, ch.TE
 
 
 class PeerRobot(Peer):
-    """One robot and its own centre: `begin`, then `handle_sample` and `tick`, until `finished`."""
+    """One robot and its own centre."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class PeerRobot(Peer):
         return out + self.grown()
 
     def _from_fold(self, messages: Sequence[Outgoing]) -> list[Outgoing]:
-        """Rename the fold's messages to this robot's; hand the prior to the estimator first."""
+        """Rename the fold's messages; hand the prior to the estimator first."""
         out: list[Outgoing] = []
         for each in messages:
             channel = _OF_THE_FOLD.get(each.channel)

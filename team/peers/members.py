@@ -1,7 +1,4 @@
-"""A member of the team's set: a message's original bytes and its name in the set.
-
-Members are the inputs of a map, and `Certificate` and `Concluded`, which are none.
-"""
+"""A member of the team's set: a message's original bytes and its name in the set."""
 
 import hashlib
 from dataclasses import dataclass
@@ -60,7 +57,7 @@ def member_of(key: str, payload: bytes, signature: bytes = b"") -> Member:
 
 
 def about(message: m.Message) -> str:
-    """Return the robot, or saved map, to whose share of the set a member belongs."""
+    """Return the robot or saved map that a member is about."""
     if isinstance(message, m.GivenUp):
         return ch.robot_of(message.node) or ""
     if isinstance(message, m.SavedMap):

@@ -1,7 +1,6 @@
 """Replicate the team's set between peers, over third robots, too.
 
-The node publishes a summary when its set has changed or a node appears, requests members that it
-lacks, and answers requests.
+A node publishes a summary, requests the members that it lacks, and answers requests.
 """
 
 from collections import defaultdict
@@ -25,7 +24,7 @@ GIVEN_BYTES = 32 * 2**20
 
 
 class Given:
-    """Bytes sent within the current second, to all nodes: names in requests are not proven."""
+    """Bytes sent within the current second."""
 
     def __init__(self) -> None:
         self._second = 0
@@ -89,7 +88,7 @@ MOST_OPEN = 16_384
 
 @dataclass
 class NodeTraffic:
-    """Traffic from one node: new members, and all bytes."""
+    """New members and bytes from one node."""
 
     members: int = 0
     bytes: int = 0
@@ -98,9 +97,8 @@ class NodeTraffic:
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    known: nodes that may have a set. proofs: checks members that come over third nodes; None: no
-    keys, every node is trusted. unsaved: new members since last cleared. refused, last_refused:
-    number of rejected members, and the last reason.
+    known: nodes that may have a set. proofs: None: no keys, every node is trusted. unsaved: new
+    members since last cleared.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -152,7 +150,7 @@ class PeerNode:
         return True
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
-        """Take a sample on a member's key as `take` does; a certificate must be the authority's."""
+        """Take a member's sample; a certificate must be the authority's."""
         try:
             member = member_of(sample.key, sample.payload)
         except (WireError, ValueError) as error:
@@ -192,9 +190,8 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """Yield queued messages for the fold: operators' orders first, `Done` last.
-
-        Orders come first since the fold may end with a stream's last member.
+        """Yield queued messages for the fold: operators' orders first, since the fold may end with
+        a stream's last member; `Done` last.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)
@@ -212,7 +209,7 @@ class PeerNode:
     # Exchange.
 
     def take_summary(self, summary: m.SetSummary) -> list[Outgoing]:
-        """Request a summary's missing members; publish one where that node lacks members."""
+        """Request a summary's missing members."""
         if summary.node == self.node:
             return []
         if summary.node not in self.known:
@@ -260,7 +257,7 @@ class PeerNode:
                 self._asked.pop((stream, message.sequence), None)
 
     def _forget_questions(self) -> None:
-        """Let requests expire; nodes that failed to send members are asked last."""
+        """Let requests expire; nodes that failed to answer are asked last."""
         over = {name: of for name, of in self._asked.items() if of[0] <= self._now_s}
         for node in {node for name, (_, node) in over.items() if self._lacks(*name)}:
             self._failures[node] = self._failures.get(node, 0) + 1
@@ -270,7 +267,7 @@ class PeerNode:
         return sequence >= 0 and sequence not in self.replica.share_of(stream).complete
 
     def request_rest(self, node: str) -> list[Outgoing]:
-        """Request the rest from a node that has answered."""
+        """Request the rest of a summary."""
         received = self._summaries.get(node)
         return [] if received is None else self._request_from(received[1])
 
@@ -303,6 +300,6 @@ class PeerNode:
 
     @property
     def agrees(self) -> dict[str, bool]:
-        """For each node with a summary, whether its set equals this one."""
+        """Whether each node's set equals this one."""
         digest = self.replica.digest
         return {n: s.digest == digest for n, (_, s) in sorted(self._summaries.items())}

@@ -1,12 +1,9 @@
 """Verify by signatures that a member carried by a third node is its author's.
 
-Every robot publishes its certificates, themselves members, and the signature of each of its
-members. An operator signs its orders with its certificate in front.
-
-A member is proven by any certificate of its author that the authority issued, that is not revoked,
-and that had not expired at the member's stamp, by the author's clock. A certificate of a later
-generation proves that the earlier ones are revoked; a roster beside the own key names further
-revocations.
+Certificates are members. A member is proven by any certificate of its author that the authority
+issued, that is not revoked, and that had not expired at the member's stamp, by the author's clock.
+A certificate of a later generation, or a roster, revokes the earlier ones. An operator's signature
+contains its certificate.
 """
 
 from collections.abc import Iterator
@@ -30,7 +27,7 @@ ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
 
 @runtime_checkable
 class Signs(Protocol):
-    """Sign as one node, and verify other nodes' signatures (`team/keys/signing.py: Signer`)."""
+    """Sign as one node, and verify others' signatures (`team/keys/signing.py: Signer`)."""
 
     certificate: bytes
 
@@ -48,7 +45,7 @@ class Signs(Protocol):
 
 
 class Proofs:
-    """Signatures of one peer, which decide on the members that it accepts."""
+    """Signatures of one peer."""
 
     def __init__(self, robot: str, signer: Signs) -> None:
         self._robot = robot
@@ -82,9 +79,7 @@ class Proofs:
             signatures[signature.member] = signature.signature
 
     def of(self, member: Member) -> bytes:
-        """Return a member's signature; empty if missing, and for a certificate, signed by the
-        authority.
-        """
+        """Return a member's signature; empty if missing, and for a certificate."""
         if isinstance(member.message, m.Certificate):
             return b""
         publisher = signed_by(member)
@@ -154,7 +149,7 @@ class Proofs:
 
 
 def signed_by(member: Member) -> str:
-    """Return the node whose signature proves a member: its robot, or `operator`."""
+    """Return the author of a member: its robot, or `operator`."""
     return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
 
 

@@ -1,7 +1,6 @@
 """One peer's copy of the team's set: grow-only, independent of the order of arrival.
 
-Of two members of one name the smaller hash stays, so all peers agree. The bytes about each robot
-are limited.
+Of two members of one name the smaller hash stays. The bytes about each robot are limited.
 """
 
 import hashlib
@@ -60,7 +59,7 @@ class StreamShare:
     newest_ns: int = 0
 
     def parcel(self, sequence: int) -> list[Member]:
-        """Return a complete submap after its inter-robot measurements, without surplus ones."""
+        """Return a complete submap after its inter-robot measurements."""
         submap, factors = self.submaps[sequence], self.factors.get(sequence, {})
         assert isinstance(submap.message, m.Submap)
         looks = sorted(factors)[: submap.message.sightings]
@@ -88,10 +87,7 @@ class StreamShare:
 
 
 class Replica:
-    """The set of a team with the given robots, as one peer has it.
-
-    replacements: contradictions of members already passed to the fold.
-    """
+    """One peer's copy of the set; replacements: changed members of streams."""
 
     def __init__(self, robots: Iterable[str], share: int = SHARE) -> None:
         self.robots = tuple(sorted(robots))
@@ -103,7 +99,7 @@ class Replica:
         self._announced: Announcement | None = None
 
     def add(self, member: Member) -> Outcome:
-        """Add a member; raises RefusedError for another team's or beyond a bound."""
+        """Add a member; raises RefusedError."""
         message = member.message
         robot = about(message)
         if robot.startswith(MAP) and len(self.statements) < len(self.robots) + MOST_MAPS:
@@ -199,7 +195,7 @@ class Replica:
 
     @property
     def concluded(self) -> dict[str, m.Concluded]:
-        """Conclusions of the peers whose final map is published, by robot."""
+        """Conclusions of the peers with a final map, by robot."""
         found = {}
         for robot, statements in self.statements.items():
             member = statements.get(("concluded", 0))
@@ -208,7 +204,7 @@ class Replica:
         return found
 
     def certificates_of(self, robot: str) -> Iterator[bytes]:
-        """Yield the certificates of a robot: several where it was renewed."""
+        """Yield the certificates of a robot."""
         for member in self.statements.get(robot, {}).values():
             if isinstance(member.message, m.Certificate):
                 yield member.message.certificate
@@ -234,7 +230,7 @@ class Replica:
     # Summaries.
 
     def holding(self, stream: Stream) -> m.Holding | None:
-        """Return a stream's holding for a summary; None where nothing can be requested."""
+        """Return a stream's holding; None where nothing can be requested."""
         share = self.share_of(stream)
         if share.start is None and not share.complete:
             return None
@@ -253,7 +249,7 @@ class Replica:
         return self.announcement.digest
 
     def summary(self, node: str, serial: int, stamp_ns: int) -> m.SetSummary:
-        """Make a summary of the set, small enough to be repeated."""
+        """Make a summary of the set."""
         announced = self.announcement
         return m.SetSummary(
             stamp_ns=stamp_ns,
@@ -285,7 +281,7 @@ class Replica:
 
 
 class Announcement(NamedTuple):
-    """Contents of a summary: digest of the set, holdings, and statements about each robot."""
+    """Contents of a summary."""
 
     digest: bytes
     holdings: dict[Stream, m.Holding]
@@ -315,7 +311,6 @@ def _stated(message: m.Message) -> tuple[str, int]:
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
-    """Rank a later conclusion, else the smaller hash, higher."""
     serial = member.message.serial if isinstance(member.message, m.Concluded) else 0
     return serial, bytes(255 - byte for byte in member.hash)
 

@@ -1,4 +1,4 @@
-"""A peer's or a centre's set on disk: an append-only file, loaded after a restart.
+"""A set on disk: an append-only file, loaded after a restart.
 
 Records follow eight bytes that identify the file: length and CRC-32 of the body, four bytes each,
 little-endian; the body is a MessagePack array [key, payload, signature]. A truncated last record is
@@ -41,7 +41,7 @@ class SetFileError(RuntimeError):
 
 
 class Record(NamedTuple):
-    """An intact record: its place in the file, and its member; None for another version's."""
+    """The place of an intact record, and its member; None for another version's."""
 
     begin: int
     end: int
@@ -66,8 +66,7 @@ def records_in(content: bytes) -> Iterator[Record]:
 def _next_record(content: bytes, at: int) -> int | None:
     """Find the first intact record from `at` on.
 
-    A damaged record of valid length is skipped as a whole: its payload might contain forged
-    records.
+    A damaged record of valid length is skipped as a whole, with any forged ones in its payload.
     """
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
         following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]
@@ -100,7 +99,7 @@ def _member_in(body: bytes) -> Member | None:
 
 
 def missing_in(members: Iterable[Member]) -> list[str]:
-    """Report the submaps that a set lacks before the last one of each stream."""
+    """Describe the submaps that a set lacks before the last one of each stream."""
     found: defaultdict[tuple[str, int], IntervalSet] = defaultdict(IntervalSet)
     for member in members:
         message = member.message
@@ -115,10 +114,10 @@ def missing_in(members: Iterable[Member]) -> list[str]:
 
 
 class SetFile:
-    """The file of one set; without a path in memory only. Raises SetFileError for an unusable one.
+    """The file of one set; None: in memory only. Raises SetFileError.
 
-    members: those in it when opened. torn: bytes of an incomplete last record, cut off. lost: other
-    damage, in words. Members that cannot be written are reported and written later.
+    torn: bytes of an incomplete last record. lost: other damage, in words. Members that cannot be
+    written are reported and written later.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -164,12 +163,12 @@ class SetFile:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Members missing in the file, for the status of its process."""
+        """Members missing in the file."""
         failure = self._failure and f"{self._failure}: {len(self._pending)} members are not stored"
         return tuple(text for text in (failure, self.lost) if text)
 
     def append(self, members: Iterable[Member]) -> None:
-        """Append members; after an error, with those not written before."""
+        """Append members, and those that an error kept back."""
         if self._file is not None:
             self._pending += members
             if self._pending and time.monotonic() >= self._retry_s:
@@ -192,7 +191,7 @@ class SetFile:
         self._pending, self._failure, self._retry_s = [], "", 0.0
 
     def _write(self, file: FileIO, data: bytes, at: int) -> None:
-        """Write all bytes, in as many pieces as the system takes; none after an error."""
+        """Write all bytes, or none after an error."""
         done = 0
         try:
             while done < len(data):
@@ -220,7 +219,7 @@ def _is_cut_off(content: bytes, at: int) -> bool:
 
 
 def _is_foreign(content: bytes) -> bool:
-    """Return whether a file's beginning is not ours; zeros remain after a power failure."""
+    """Whether a file's beginning is not ours; zeros remain after a power failure."""
     begin = content[: len(MAGIC)]
     ours = all(here in (0, there) for here, there in zip(begin, MAGIC, strict=False))
     return any(content) and not (ours and any(begin))

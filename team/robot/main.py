@@ -12,9 +12,8 @@ import msgspec
 
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.containment import reply_of
-from teamslam.team.missing_measurements import ASK_TIMEOUT_S, MissingMeasurements
 from teamslam.team.robot.node import robot_node
-from teamslam.team.shell import RECORDER, Shell
+from teamslam.team.shell import ASK_TIMEOUT_S, RECORDER, MissingMeasurements, Shell
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, BusError, Sample, Tap
