@@ -49,7 +49,7 @@ def write_map(path: Path, saved: m.SavedMap) -> None:
 
 
 def submap_of(saved: m.SavedMap) -> m.Submap:
-    """Make the submap of a saved map: landmarks only, before the team's time, no two of them one."""
+    """Make the submap of a saved map: landmarks only, all distinct, before the team's time."""
     n = 2 * len(ids(saved.ids, "ids"))
     submap = member_of(
         saved.author,

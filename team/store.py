@@ -48,12 +48,12 @@ _EMPTY = StoredStream()
 
 
 class SubmapStore:
-    """The members of the team's set. Refused are a submap whose measurements overlap another's (law
-    1), and a member that differs from a stored one of its name.
+    """The members of the team's set.
 
-    chains: the submaps available to a map, of streams with an initial pose; they grow in place.
-    withdrawals: the first order on each robot. verdicts: those in force, with their landmarks in
-    order.
+    A submap whose measurements overlap another's (law 1), and a member that differs from a stored
+    one of its name, are refused. chains: the submaps available to a map, of streams with an initial
+    pose; they grow in place. withdrawals: the first order on each robot. verdicts: those in force,
+    with their landmarks in order.
     """
 
     def __init__(self) -> None:
