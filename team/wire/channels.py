@@ -98,150 +98,113 @@ class Channel:
 
 
 # fmt: off
-START = Channel(name="start", template="source/{robot}/start", message=m.InitialPose, rate="once per incarnation", delivery="all",
-                meaning="measurement 0: the initial pose, if known")
-ODOMETRY = Channel(name="odometry", template="source/{robot}/odometry", message=m.Odometry, rate="8-100 Hz", delivery="stream",
-                   meaning="an odometry interval: speeds, a motion, or a car's steering", alternatives=(m.Increment, m.Steering))
-OBSERVATIONS = Channel(name="observations", template="source/{robot}/observations", message=m.Observations, rate="1-30 Hz", delivery="stream",
-                       alternatives=(m.Points, m.Detections), meaning="landmarks: range and bearing or points, with or without identities")
-SIGHTINGS = Channel(name="sightings", template="source/{robot}/sightings", message=m.Sightings, rate="0-10 Hz", delivery="stream",
-                    meaning="range and bearing to teammates")
-FIXES = Channel(name="fixes", template="source/{robot}/fixes", message=m.Fix, rate="0-10 Hz", delivery="stream",
-                meaning="absolute positions, as by GNSS")
+# name, key, message, rate, delivery, meaning
+START = Channel("start", "source/{robot}/start", m.InitialPose, "once per incarnation", "all", "measurement 0: the initial pose, if known")
+ODOMETRY = Channel("odometry", "source/{robot}/odometry", m.Odometry, "8-100 Hz", "stream",
+                   "an odometry interval: speeds, a motion, or a car's steering", alternatives=(m.Increment, m.Steering))
+OBSERVATIONS = Channel("observations", "source/{robot}/observations", m.Observations, "1-30 Hz", "stream",
+                       "landmarks: range and bearing or points, with or without identities", alternatives=(m.Points, m.Detections))
+SIGHTINGS = Channel("sightings", "source/{robot}/sightings", m.Sightings, "0-10 Hz", "stream", "range and bearing to teammates")
+FIXES = Channel("fixes", "source/{robot}/fixes", m.Fix, "0-10 Hz", "stream", "absolute positions, as by GNSS")
 SENSORS = (START, ODOMETRY, OBSERVATIONS, SIGHTINGS, FIXES)
-HEAD = Channel(name="head", template="source/{robot}/head", message=m.StreamHead, rate="1 Hz", delivery="latest",
-               meaning="a driver's count of measurements, and the state of its stream")
+HEAD = Channel("head", "source/{robot}/head", m.StreamHead, "1 Hz", "latest", "a driver's count of measurements, and the state of its stream")
 
-TRUTH = Channel(name="truth", template="truth/{robot}", message=m.Truth, rate="1 Hz, batched", delivery="all",
-                meaning="true poses, for the evaluation only")
-TRUTH_LANDMARKS = Channel(name="truth_landmarks", template="truth_landmarks", message=m.TruthLandmarks, rate="once", delivery="latest",
-                          meaning="true landmarks, for the evaluation only")
-TRUTH_LABELS = Channel(name="truth_labels", template="truth_labels/{robot}", message=m.TruthLabels, rate="once", delivery="all",
-                       meaning="true landmarks of detections, for the evaluation only")
-TRUTH_POSITIONS = Channel(name="truth_positions", template="truth_positions/{robot}", message=m.TruthPositions, rate="once", delivery="all",
-                          meaning="positions by another sensor, for the evaluation only")
+TRUTH = Channel("truth", "truth/{robot}", m.Truth, "1 Hz, batched", "all", "true poses, for the evaluation only")
+TRUTH_LANDMARKS = Channel("truth_landmarks", "truth_landmarks", m.TruthLandmarks, "once", "latest", "true landmarks, for the evaluation only")
+TRUTH_LABELS = Channel("truth_labels", "truth_labels/{robot}", m.TruthLabels, "once", "all", "true landmarks of detections, for the evaluation only")
+TRUTH_POSITIONS = Channel("truth_positions", "truth_positions/{robot}", m.TruthPositions, "once", "all",
+                          "positions by another sensor, for the evaluation only")
 
-ROBOT_CONFIG = Channel(name="robot_config", template="robot/{robot}/config", message=m.Configuration, rate="once per incarnation", delivery="latest",
-                       meaning="the robot's configuration")
-SUBMAP = Channel(name="submap", template="robot/{robot}/submap", message=m.Submap, rate="one per window", delivery="all", recomputable=True,
-                 meaning="a submap; input of the rule `join`")
-ASSOCIATION = Channel(name="association", template="robot/{robot}/association", message=m.Association, rate="0-1 per window", delivery="latest",
-                      recomputable=True, meaning="the association of each detection")
-SIGHTING_FACTOR = Channel(name="sighting_factor", template="robot/{robot}/sighting_factor", message=m.SightingFactor,
-                          rate="0-1 per teammate and node", delivery="all", recomputable=True,
-                          meaning="an inter-robot factor; input of the rule `join`")
-RENDEZVOUS = Channel(name="rendezvous", template="robot/{robot}/rendezvous", message=m.Rendezvous, rate="0-1 per window and meeting", delivery="all",
-                     meaning="release of buffered submaps at an encounter")
-OWN_MAP = Channel(name="own_map", template="robot/{robot}/own/map", message=m.MapEstimate, rate="one per window (pose_s) or exchange",
-                  delivery="latest", recomputable=True, meaning="running map; input of rules with feedback")
-OWN_POSE = Channel(name="own_pose", template="robot/{robot}/own/pose", message=m.PoseEstimate, rate="one per keyframe", delivery="latest",
-                   recomputable=True, meaning="running pose from own measurements")
-TEAM_POSE = Channel(name="team_pose", template="robot/{robot}/team/pose", message=m.PoseEstimate, rate="one per keyframe", delivery="latest",
-                    recomputable=True, meaning="running pose in the team's map; never an input of fusion")
-PARTICLES = Channel(name="particles", template="robot/{robot}/particles", message=m.ParticleCloud, rate="one per window (pose_s)", delivery="latest",
-                    recomputable=True, meaning="thinned particles, for viewers")
-INNOVATION = Channel(name="innovation", template="robot/{robot}/innovation", message=m.Innovation, rate="one per window", delivery="latest",
-                     recomputable=True, meaning="NIS of a window's measurements")
-ROBOT_PROGRESS = Channel(name="robot_progress", template="robot/{robot}/progress", message=m.Progress, rate="every 64 measurements",
-                         delivery="latest", meaning="credit for the world")
-ROBOT_HEAD = Channel(name="robot_head", template="robot/{robot}/head", message=m.StreamHead, rate="at the driver's end", delivery="latest",
-                     meaning="its driver's last `head`, for a restarted centre")
-ROBOT_DONE = Channel(name="robot_done", template="robot/{robot}/done", message=m.Done, rate="once per incarnation", delivery="latest",
-                     recomputable=True, meaning="all measurements are consumed, the last submap is sent")
+ROBOT_CONFIG = Channel("robot_config", "robot/{robot}/config", m.Configuration, "once per incarnation", "latest", "the robot's configuration")
+SUBMAP = Channel("submap", "robot/{robot}/submap", m.Submap, "one per window", "all", "a submap; input of the rule `join`", recomputable=True)
+ASSOCIATION = Channel("association", "robot/{robot}/association", m.Association, "0-1 per window", "latest", "the association of each detection",
+                      recomputable=True)
+SIGHTING_FACTOR = Channel("sighting_factor", "robot/{robot}/sighting_factor", m.SightingFactor, "0-1 per teammate and node", "all",
+                          "an inter-robot factor; input of the rule `join`", recomputable=True)
+RENDEZVOUS = Channel("rendezvous", "robot/{robot}/rendezvous", m.Rendezvous, "0-1 per window and meeting", "all",
+                     "release of buffered submaps at an encounter")
+OWN_MAP = Channel("own_map", "robot/{robot}/own/map", m.MapEstimate, "one per window (pose_s) or exchange", "latest",
+                  "running map; input of rules with feedback", recomputable=True)
+OWN_POSE = Channel("own_pose", "robot/{robot}/own/pose", m.PoseEstimate, "one per keyframe", "latest", "running pose from own measurements",
+                   recomputable=True)
+TEAM_POSE = Channel("team_pose", "robot/{robot}/team/pose", m.PoseEstimate, "one per keyframe", "latest",
+                    "running pose in the team's map; never an input of fusion", recomputable=True)
+PARTICLES = Channel("particles", "robot/{robot}/particles", m.ParticleCloud, "one per window (pose_s)", "latest", "thinned particles, for viewers",
+                    recomputable=True)
+INNOVATION = Channel("innovation", "robot/{robot}/innovation", m.Innovation, "one per window", "latest", "NIS of a window's measurements",
+                     recomputable=True)
+ROBOT_PROGRESS = Channel("robot_progress", "robot/{robot}/progress", m.Progress, "every 64 measurements", "latest", "credit for the world")
+ROBOT_HEAD = Channel("robot_head", "robot/{robot}/head", m.StreamHead, "at the driver's end", "latest",
+                     "its driver's last `head`, for a restarted centre")
+ROBOT_DONE = Channel("robot_done", "robot/{robot}/done", m.Done, "once per incarnation", "latest",
+                     "all measurements are consumed, the last submap is sent", recomputable=True)
 
-CENTRAL_CONFIG = Channel(name="central_config", template="central/config", message=m.Configuration, rate="once", delivery="latest",
-                         meaning="the centre's configuration")
-FUSED_MAP = Channel(name="fused_map", template="central/map", message=m.FusedMap, rate="one per broadcast", delivery="latest", recomputable=True,
-                    meaning="the team's map")
-PRIOR = Channel(name="prior", template="central/prior/{robot}", message=m.Prior, rate="with news, at least each 8th broadcast", delivery="latest",
-                recomputable=True, meaning="the joint marginal for a robot")
-ORDER = Channel(name="order", template="operator/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all",
-                meaning="an operator's order to withdraw a robot")
-VERDICT = Channel(name="verdict", template="operator/verdict/{robot}", message=m.Verdict, rate="once per verdict", delivery="all",
-                  meaning="an operator's statement that two unnamed landmarks are one, or two")
-WITHDRAWAL = Channel(name="withdrawal", template="central/withdrawal/{robot}", message=m.Withdrawal, rate="once", delivery="all",
-                     meaning="a withdrawal that the centre carries out")
-WITHDRAWALS_HEARD = Channel(name="withdrawals_heard", template="robot/{robot}/withdrawals", message=m.WithdrawalHeard, rate="never", delivery="all",
-                            meaning="not published; read from logs of earlier versions")
-GIVEN_UP = Channel(name="given_up", template="operator/given_up/{node}", message=m.GivenUp, rate="once", delivery="all",
-                   meaning="an operator's order that no process waits for a node")
-END_ORDER = Channel(name="end_order", template="operator/end", message=m.TeamEnd, rate="once", delivery="all",
-                    meaning="an operator's order to end a live team")
-TEAM_END = Channel(name="team_end", template="central/end", message=m.TeamEnd, rate="once", delivery="latest",
-                   meaning="the order to end, repeated for late joiners")
-FINAL_MAP = Channel(name="final_map", template="central/final", message=m.FusedMap, rate="once", delivery="latest", recomputable=True,
-                    meaning="the final map with its joint covariance")
-SAVED_MAP = Channel(name="saved_map", template="central/saved_map/{robot}", message=m.SavedMap, rate="once", delivery="all",
-                    meaning="a map of an earlier day; a member of the set")
-TRAJECTORY = Channel(name="trajectory", template="central/trajectory/{robot}", message=m.Trajectory, rate="once per incarnation", delivery="all",
-                     recomputable=True, meaning="smoothed ends of the submaps, or all keyframes")
-CENTRAL_POSE = Channel(name="central_pose", template="central/pose/{robot}", message=m.PoseEstimate, rate="one per keyframe or broadcast",
-                       delivery="latest", recomputable=True, meaning="running pose by a rule on measurements")
-CENTRAL_PROGRESS = Channel(name="central_progress", template="central/progress/{robot}", message=m.Progress, rate="one per submap", delivery="latest",
-                           meaning="credit for the robots")
+CENTRAL_CONFIG = Channel("central_config", "central/config", m.Configuration, "once", "latest", "the centre's configuration")
+FUSED_MAP = Channel("fused_map", "central/map", m.FusedMap, "one per broadcast", "latest", "the team's map", recomputable=True)
+PRIOR = Channel("prior", "central/prior/{robot}", m.Prior, "with news, at least each 8th broadcast", "latest", "the joint marginal for a robot",
+                recomputable=True)
+ORDER = Channel("order", "operator/withdrawal/{robot}", m.Withdrawal, "once", "all", "an operator's order to withdraw a robot")
+VERDICT = Channel("verdict", "operator/verdict/{robot}", m.Verdict, "once per verdict", "all",
+                  "an operator's statement that two unnamed landmarks are one, or two")
+WITHDRAWAL = Channel("withdrawal", "central/withdrawal/{robot}", m.Withdrawal, "once", "all", "a withdrawal that the centre carries out")
+WITHDRAWALS_HEARD = Channel("withdrawals_heard", "robot/{robot}/withdrawals", m.WithdrawalHeard, "never", "all",
+                            "not published; read from logs of earlier versions")
+GIVEN_UP = Channel("given_up", "operator/given_up/{node}", m.GivenUp, "once", "all", "an operator's order that no process waits for a node")
+END_ORDER = Channel("end_order", "operator/end", m.TeamEnd, "once", "all", "an operator's order to end a live team")
+TEAM_END = Channel("team_end", "central/end", m.TeamEnd, "once", "latest", "the order to end, repeated for late joiners")
+FINAL_MAP = Channel("final_map", "central/final", m.FusedMap, "once", "latest", "the final map with its joint covariance", recomputable=True)
+SAVED_MAP = Channel("saved_map", "central/saved_map/{robot}", m.SavedMap, "once", "all", "a map of an earlier day; a member of the set")
+TRAJECTORY = Channel("trajectory", "central/trajectory/{robot}", m.Trajectory, "once per incarnation", "all",
+                     "smoothed ends of the submaps, or all keyframes", recomputable=True)
+CENTRAL_POSE = Channel("central_pose", "central/pose/{robot}", m.PoseEstimate, "one per keyframe or broadcast", "latest",
+                       "running pose by a rule on measurements", recomputable=True)
+CENTRAL_PROGRESS = Channel("central_progress", "central/progress/{robot}", m.Progress, "one per submap", "latest", "credit for the robots")
 
-WORLD_CONFIG = Channel(name="world_config", template="world/config", message=m.Configuration, rate="once", delivery="latest", meaning="the scenario")
-KNOWN_MAP = Channel(name="known_map", template="world/known_map", message=m.KnownMap, rate="once", delivery="latest",
-                    meaning="prior map of robots that only localise")
-END = Channel(name="end", template="world/end", message=m.End, rate="once", delivery="latest", meaning="end of all streams, with their last counters")
-RADIO = Channel(name="radio", template="world/radio", message=m.RadioPlan, rate="once", delivery="latest",
-                meaning="links of a simulated radio over time")
-RECORDER_PROGRESS = Channel(name="recorder_progress", template="recorder/progress/{robot}", message=m.Progress,
-                            rate="every 256 measurements, every submap", delivery="latest", recorded=False,
-                            meaning="credit for the world; a robot may leave")
-STATUS = Channel(name="status", template="{node}/status", message=m.Status, rate="1 Hz", delivery="latest", meaning="state of a node, for people")
-FAULT = Channel(name="fault", template="{node}/fault", message=m.Fault, rate="per exception", delivery="all",
-                meaning="a message that a node could not handle")
-ALIVE = Channel(name="alive", template="{node}/alive", message=m.Liveliness, rate="on change", delivery="latest",
-                meaning="liveliness token; a log has its changes as messages")
+WORLD_CONFIG = Channel("world_config", "world/config", m.Configuration, "once", "latest", "the scenario")
+KNOWN_MAP = Channel("known_map", "world/known_map", m.KnownMap, "once", "latest", "prior map of robots that only localise")
+END = Channel("end", "world/end", m.End, "once", "latest", "end of all streams, with their last counters")
+RADIO = Channel("radio", "world/radio", m.RadioPlan, "once", "latest", "links of a simulated radio over time")
+RECORDER_PROGRESS = Channel("recorder_progress", "recorder/progress/{robot}", m.Progress, "every 256 measurements, every submap", "latest",
+                            "credit for the world; a robot may leave", recorded=False)
+STATUS = Channel("status", "{node}/status", m.Status, "1 Hz", "latest", "state of a node, for people")
+FAULT = Channel("fault", "{node}/fault", m.Fault, "per exception", "all", "a message that a node could not handle")
+ALIVE = Channel("alive", "{node}/alive", m.Liveliness, "on change", "latest", "liveliness token; a log has its changes as messages")
 
-TALLY = Channel(name="tally", template="{node}/tally", message=m.Tally, rate="once, at the end", delivery="latest",
-                meaning="number of messages that the process has published on each key")
-RECORDED = Channel(name="recorded", template="recorder/recorded/{node}", message=m.Tally, rate="1 Hz, after the process's end", delivery="latest",
-                   recorded=False, meaning="keys of the tally of which the recorder lacks messages; with none the process may leave")
+TALLY = Channel("tally", "{node}/tally", m.Tally, "once, at the end", "latest", "number of messages that the process has published on each key")
+RECORDED = Channel("recorded", "recorder/recorded/{node}", m.Tally, "1 Hz, after the process's end", "latest",
+                   "keys of the tally of which the recorder lacks messages; with none the process may leave", recorded=False)
 
-MEASUREMENTS = Channel(name="readings", template="source/{robot}/readings", message=m.MeasurementsRequest, rate="query", delivery="stream",
-                       recorded=False, meaning="measurements of a stream")
-SUBMAPS = Channel(name="submaps", template="central/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False,
-                  meaning="initial poses, submaps and inter-robot factors of the centre's set")
-SENT = Channel(name="sent", template="robot/{robot}/submaps", message=m.SubmapsRequest, rate="query", delivery="stream", recorded=False,
-               meaning="initial poses, submaps and inter-robot factors that the robot has sent")
+MEASUREMENTS = Channel("readings", "source/{robot}/readings", m.MeasurementsRequest, "query", "stream", "measurements of a stream", recorded=False)
+SUBMAPS = Channel("submaps", "central/submaps", m.SubmapsRequest, "query", "stream",
+                  "initial poses, submaps and inter-robot factors of the centre's set", recorded=False)
+SENT = Channel("sent", "robot/{robot}/submaps", m.SubmapsRequest, "query", "stream",
+               "initial poses, submaps and inter-robot factors that the robot has sent", recorded=False)
 
-KEPT = Channel(name="kept", template="router/kept", message=m.KeptRequest, rate="query", delivery="stream", recorded=False,
-               meaning="stored ends of the team and orders, as `kept`")
+KEPT = Channel("kept", "router/kept", m.KeptRequest, "query", "stream", "stored ends of the team and orders, as `kept`", recorded=False)
 
-TEAM_CONFIG = Channel(name="team_config", template="robot/{robot}/team/config", message=m.Configuration, rate="once", delivery="latest",
-                      meaning="the configuration of the peer's fold")
-TEAM_MAP = Channel(name="team_map", template="robot/{robot}/team/map", message=m.FusedMap, rate="one per broadcast", delivery="latest",
-                   recomputable=True, meaning="the team's map by the peer's fold")
-TEAM_PRIOR = Channel(name="team_prior", template="robot/{robot}/team/prior", message=m.Prior, rate="with news, at least each 8th broadcast",
-                     delivery="latest", recomputable=True, meaning="the prior by the peer's fold")
-TEAM_FINAL = Channel(name="team_final", template="robot/{robot}/team/final", message=m.FusedMap, rate="once", delivery="latest", recomputable=True,
-                     meaning="the final map by the peer's fold")
-TEAM_TRAJECTORY = Channel(name="team_trajectory", template="robot/{robot}/team/trajectory", message=m.Trajectory, rate="once per incarnation",
-                          delivery="all", recomputable=True, meaning="the peer's smoothed path in its final map")
-TEAM_WITHDRAWAL = Channel(name="team_withdrawal", template="robot/{robot}/team/withdrawal", message=m.Withdrawal,
-                          rate="once per robot that it withdraws", delivery="all", meaning="a withdrawal by the peer's fold")
-SET_SUMMARY = Channel(name="set_summary", template="{node}/set", message=m.SetSummary, rate="1 Hz at most, on change", delivery="latest",
-                      meaning="summary of a peer's set")
-CONCLUDED = Channel(name="concluded", template="robot/{robot}/concluded", message=m.Concluded, rate="once", delivery="all",
-                    meaning="a peer has its final map")
-CERTIFICATE = Channel(name="certificate", template="robot/{robot}/certificate", message=m.Certificate, rate="once, with keys", delivery="all",
-                      meaning="the certificate of a robot's signatures")
-SIGNATURE = Channel(name="signature", template="robot/{robot}/signature", message=m.Signature, rate="one per member, with keys", delivery="all",
-                    recorded=False, meaning="a robot's signature of one of its members")
-ORDER_SIGNATURE = Channel(name="order_signature", template="operator/signature/{robot}", message=m.Signature, rate="one per order, with keys",
-                          delivery="all", recorded=False, meaning="an operator's signature of an order")
-FOLD = Channel(name="fold", template="robot/{robot}/fold", message=m.FoldRequest, rate="query", delivery="stream", recorded=False,
-               meaning="the map of the peer's set as it is now")
-SITE = Channel(name="site", template="central/site", message=m.FoldRequest, rate="query", delivery="stream", recorded=False,
-               meaning="the map of the centre's set as it is now, as `saved_map`")
-MEMBERS = Channel(name="members", template="{node}/members", message=m.MembersRequest, rate="query", delivery="stream", recorded=False,
-                  meaning="members of the peer's set, as `carried`")
-CARRIED = Channel(name="carried", template="{node}/carried", message=m.Members, rate="on request", delivery="stream", recorded=False,
-                  meaning="members of any robot from a peer's set")
+TEAM_CONFIG = Channel("team_config", "robot/{robot}/team/config", m.Configuration, "once", "latest", "the configuration of the peer's fold")
+TEAM_MAP = Channel("team_map", "robot/{robot}/team/map", m.FusedMap, "one per broadcast", "latest", "the team's map by the peer's fold",
+                   recomputable=True)
+TEAM_PRIOR = Channel("team_prior", "robot/{robot}/team/prior", m.Prior, "with news, at least each 8th broadcast", "latest",
+                     "the prior by the peer's fold", recomputable=True)
+TEAM_FINAL = Channel("team_final", "robot/{robot}/team/final", m.FusedMap, "once", "latest", "the final map by the peer's fold", recomputable=True)
+TEAM_TRAJECTORY = Channel("team_trajectory", "robot/{robot}/team/trajectory", m.Trajectory, "once per incarnation", "all",
+                          "the peer's smoothed path in its final map", recomputable=True)
+TEAM_WITHDRAWAL = Channel("team_withdrawal", "robot/{robot}/team/withdrawal", m.Withdrawal, "once per robot that it withdraws", "all",
+                          "a withdrawal by the peer's fold")
+SET_SUMMARY = Channel("set_summary", "{node}/set", m.SetSummary, "1 Hz at most, on change", "latest", "summary of a peer's set")
+CONCLUDED = Channel("concluded", "robot/{robot}/concluded", m.Concluded, "once", "all", "a peer has its final map")
+CERTIFICATE = Channel("certificate", "robot/{robot}/certificate", m.Certificate, "once, with keys", "all", "the certificate of a robot's signatures")
+SIGNATURE = Channel("signature", "robot/{robot}/signature", m.Signature, "one per member, with keys", "all",
+                    "a robot's signature of one of its members", recorded=False)
+ORDER_SIGNATURE = Channel("order_signature", "operator/signature/{robot}", m.Signature, "one per order, with keys", "all",
+                          "an operator's signature of an order", recorded=False)
+FOLD = Channel("fold", "robot/{robot}/fold", m.FoldRequest, "query", "stream", "the map of the peer's set as it is now", recorded=False)
+SITE = Channel("site", "central/site", m.FoldRequest, "query", "stream", "the map of the centre's set as it is now, as `saved_map`", recorded=False)
+MEMBERS = Channel("members", "{node}/members", m.MembersRequest, "query", "stream", "members of the peer's set, as `carried`", recorded=False)
+CARRIED = Channel("carried", "{node}/carried", m.Members, "on request", "stream", "members of any robot from a peer's set", recorded=False)
 
-VIEW = Channel(name="view", template="view/{view}", message=m.Message, rate="1 Hz of team time", delivery="latest", meaning="figures for viewers")
+VIEW = Channel("view", "view/{view}", m.Message, "1 Hz of team time", "latest", "figures for viewers")
 # fmt: on
 
 CHANNELS: tuple[Channel, ...] = tuple(v for v in list(globals().values()) if isinstance(v, Channel))

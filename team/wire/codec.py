@@ -142,11 +142,19 @@ DEEPEST = 16
 """Deepest nesting of a message; the known ones have four levels."""
 _SCALARS = {0xC0: 0, 0xC2: 0, 0xC3: 0, 0xCA: 4, 0xCB: 8,
             0xCC: 1, 0xCD: 2, 0xCE: 4, 0xCF: 8, 0xD0: 1, 0xD1: 2, 0xD2: 4, 0xD3: 8}  # fmt: skip
-"""Number of bytes after the code of a scalar."""
 _TEXTS = {0xC4: 1, 0xC5: 2, 0xC6: 4, 0xD9: 1, 0xDA: 2, 0xDB: 4}
-"""Number of bytes of the length of a `bin` or `str`, by code."""
 _GROUPS = {0xDC: (2, 1), 0xDD: (4, 1), 0xDE: (2, 2), 0xDF: (4, 2)}
-"""Number of bytes of the length of an array or map, and of values per entry, by code."""
+_HEADS: dict[int, tuple[int, int, int, int]] = {
+    **dict.fromkeys((*range(0x80), *range(0xE0, 0x100)), (0, 0, 0, 0)),
+    **{0x80 + entries: (0, entries, 0, 2) for entries in range(16)},
+    **{0x90 + entries: (0, entries, 0, 1) for entries in range(16)},
+    **{0xA0 + size: (0, size, 1, 0) for size in range(32)},
+    **{code: (0, size, 1, 0) for code, size in _SCALARS.items()},
+    **{code: (width, 0, 1, 0) for code, width in _TEXTS.items()},
+    **{code: (width, 0, 0, each) for code, (width, each) in _GROUPS.items()},
+}
+"""By the code of a value: bytes of its length, its length where it has none, and the bytes and the
+values behind the head for each unit of the length."""
 
 
 def check_structure(payload: bytes) -> None:
@@ -172,38 +180,18 @@ def check_structure(payload: bytes) -> None:
 
 def _value_at(payload: bytes, at: int) -> tuple[int, int]:
     """Return the number of values inside the value at `at`, and the position after its head."""
-    code = _byte(payload, at)
-    at += 1
-    if code < 0x80 or code >= 0xE0:
-        return 0, at
-    if code < 0x90:
-        return 2 * (code & 15), at
-    if code < 0xA0:
-        return code & 15, at
-    if code < 0xC0:
-        return 0, at + (code & 31)
-    if code in _SCALARS:
-        return 0, at + _SCALARS[code]
-    if code in _TEXTS:
-        size, at = _length(payload, at, _TEXTS[code])
-        return 0, at + size
-    if code in _GROUPS:
-        width, each = _GROUPS[code]
-        size, at = _length(payload, at, width)
-        return size * each, at
-    raise WireError("damaged", "a value of no message")
-
-
-def _length(payload: bytes, at: int, width: int) -> tuple[int, int]:
-    if len(payload) < at + width:
-        raise _truncated()
-    return int.from_bytes(payload[at : at + width], "big"), at + width
-
-
-def _byte(payload: bytes, at: int) -> int:
     if at >= len(payload):
         raise _truncated()
-    return payload[at]
+    head = _HEADS.get(payload[at])
+    if head is None:
+        raise WireError("damaged", "a value of no message")
+    width, length, size, values = head
+    end = at + 1 + width
+    if len(payload) < end:
+        raise _truncated()
+    if width:
+        length = int.from_bytes(payload[at + 1 : end], "big")
+    return length * values, end + length * size
 
 
 def _truncated() -> WireError:
