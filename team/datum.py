@@ -7,10 +7,7 @@ from msgspec import Meta
 
 
 class Datum(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Origin of a local tangent plane on WGS84: x points east, y north.
-
-    height_m: above the ellipsoid.
-    """
+    """Origin of a tangent plane on WGS84: x east, y north; height above the ellipsoid."""
 
     latitude_deg: Annotated[float, Meta(ge=-89.0, le=89.0)]
     longitude_deg: Annotated[float, Meta(ge=-180.0, le=180.0)]

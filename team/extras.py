@@ -12,10 +12,7 @@ _OURS = re.compile(rf"{US}\[([^\]]+)\]")
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs the packages of an extra for the running Python.
-
-    It names the packages, not us, to work in a clone and from an installed package.
-    """
+    """Return the command that installs an extra's packages, by their names, for this Python."""
     packages = [*dict.fromkeys(_packages(extra))] or [f".[{extra}]"]
     return f"{shlex.quote(sys.executable)} -m pip install {' '.join(map(shlex.quote, packages))}"
 

@@ -22,7 +22,6 @@ CONVERGED_M = 1e-6
 
 
 def _earth_centred(angles: Float[np.ndarray, "n 2"], height_m: float) -> Float[np.ndarray, "n 3"]:
-    """Compute earth-centred coordinates p [m] of points at (latitude, longitude) [rad]."""
     latitude, longitude = angles.T
     s, c = np.sin(latitude), np.cos(latitude)
     N = A_M / np.sqrt(1.0 - E2 * s * s)

@@ -86,8 +86,8 @@ UNEXPLAINED = 1e-4
 class Keyframe:
     """The motion since the last keyframe, and the landmarks measured at its end.
 
-    increment: odometry (`increment_of`, `Increment.then`). ids: of the n landmarks; one may occur
-    twice. ranges [m], bearings [rad]: as reported by the sensor.
+    increment: odometry (`increment_of`, `Increment.then`). ids: one may occur twice. ranges [m],
+    bearings [rad]: as reported by the sensor.
     """
 
     increment: Increment
@@ -117,8 +117,8 @@ class JoinedMap:
     """The team's map.
 
     landmarks: means and joint covariance in the common frame. trajectories: each robot's poses at
-    the ends of its submaps. chi2, dof: chi2/dof is about 1 for right models. apart: robots whose
-    submaps are not in the map, each with the reason.
+    the ends of its submaps. chi2/dof is about 1 for right models. apart: robots whose submaps are
+    not in the map, each with the reason.
     """
 
     landmarks: LandmarkMap

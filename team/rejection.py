@@ -7,9 +7,7 @@ REJECTED = "rejected: "
 
 
 class Rejection(StrEnum):
-    """A reason to reject a measurement, as spelt by the ledger, `Done` and `teamslam
-    verify-ledger`.
-    """
+    """A reason to reject a measurement, as spelt by ledger, `Done` and `teamslam verify-ledger`."""
 
     OLDER = "older than the odometry"
     NOT_COVERED = "no odometry covers it"

@@ -123,7 +123,6 @@ class Answers:
         return [self._answer(names.tf, "tf2_msgs/msg/TFMessage", stamp_ns, ros.transforms(one))]
 
     def _odometry_at(self, stamp_ns: int) -> Pose | None:
-        """Interpolate the odometry's pose at a time; None outside of the kept poses."""
         held = self._odometry
         if not held or not held[0][0] <= stamp_ns <= held[-1][0]:
             return None

@@ -67,13 +67,12 @@ OnOdometry = Callable[[int, tuple[float, float, float], str, str], None]
 
 
 class Ros2Driver:
-    """Passes the publications on a robot's topics to its driver.
+    """Passes the publications on a robot's topics to its driver, in the order of their stamps.
 
-    taken: messages by topic; dropped: by reason; lost: published and never received. Waiting
-    messages are passed on in the order of their stamps. on_odometry: called with each odometry pose
-    and its frames. datum: origin of the plane of the team's fixes, which are dropped without one.
-    name, others: the robot's name, and the topics of the others in the file, which may be its own,
-    too.
+    taken: messages by topic; dropped: by reason; lost: published and never received. on_odometry:
+    called with each odometry pose and its frames. datum: origin of the plane of the team's fixes,
+    which are dropped without one. name, others: the robot's name, and the topics of the others in
+    the file, which may be its own, too.
     """
 
     def __init__(
@@ -166,9 +165,8 @@ class Ros2Driver:
         return len(self._backlog) + sum(map(len, self._translated.values()))
 
     def deliver(self, most: int | None = None) -> None:
-        """Pass on waiting measurements, at most `most`: the earliest stamp of all topics is next.
-
-        Measurements of one topic keep their order of arrival.
+        """Pass on at most `most` waiting measurements, by stamp; those of one topic as they
+        arrived.
         """
         count = 0
         while most is None or count < most:
@@ -278,9 +276,8 @@ class Ros2Driver:
 
     @property
     def refusal(self) -> str:
-        """Text and remedy if no detection can be assigned to this robot; else empty.
-
-        Empty also until the transforms had SILENT_S to arrive.
+        """Text and remedy if, after SILENT_S, no detection can be assigned to this robot; else
+        empty.
         """
         question = self._translator.question()
         if not question or self._translator.has_detections:

@@ -424,10 +424,7 @@ def trajectory_message(
     covariances: Float[np.ndarray, "K 3 3"],
     **start: bytes,
 ) -> m.Trajectory:
-    """Make the message of the smoothed end poses of a robot's submaps.
-
-    start: `start`, `start_covariance` and `crosses` of the message.
-    """
+    """Make the message of the smoothed ends of submaps; start: its optional fields."""
     robot, incarnation = stream
     symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return m.Trajectory(

@@ -1,7 +1,7 @@
 """The driver delivers a program's measurements to the robot's process.
 
-Each measurement is checked, written to the robot's file and published by a separate thread, so a
-call never waits for the network. Missed measurements are sent from the file.
+Each is checked, written to the robot's file and published by a separate thread, so a call never
+waits for the network. Missed measurements are sent from the file.
 """
 
 import logging
@@ -313,9 +313,7 @@ class Driver:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """(t, (x, y, theta)), the last published pose in the team's frame; None: not joined to the
-        map.
-        """
+        """The last (t, (x, y, theta)) in the team's frame; None: not joined to the map."""
         return self._node.team_pose
 
     @property
@@ -424,7 +422,6 @@ class Driver:
         self._warn(self._link.left, f"{self._link.left} at an unknown pose")
 
     def _put(self, kind: int, stamp_ns: int, payload: bytes) -> None:
-        """Append to the file, unless the program repeats a call that the file has."""
         if self._again is not None and self._again >= 0:
             calls = self._journal.calls
             if self._again < len(calls):
@@ -474,7 +471,6 @@ class Driver:
         self._put(j.START, stamp_ns, encoded(start))
 
     def _begin_anew(self, end_ns: int, stamp_ns: int) -> None:
-        """Begin the next incarnation, which only landmarks tie to the one before."""
         self._warn(
             f"gap{stamp_ns}",
             f"{self.robot}: no odometry from {1e-9 * end_ns:.3f} to {1e-9 * stamp_ns:.3f} s: its "
@@ -485,7 +481,6 @@ class Driver:
         self._odometer = Odometer(self.robot, self._bounds)
 
     def _bridge_reset(self, step: Pose, lasts_ns: int, stamp_ns: int, pose: Pose) -> Pose:
-        """Replace the motion between two poses by the last motion if the odometry was reset."""
         if not self._odometer.was_reset(step, lasts_ns, pose):
             return step
         self._warn(
@@ -512,8 +507,8 @@ class Driver:
     def _until(
         self, stamp_ns: int, length_ns: int | None, call: str, longest_s: float = GAP_S
     ) -> int | None:
-        """Return the length [ns] of the interval that ends now; None: `_drive` bridges the gap, or
-        the next incarnation begins.
+        """Return the length [ns] of the interval that ends now; None: a gap to bridge, or a new
+        start.
         """
         self._resume(stamp_ns)
         end_ns = self._odometer.end_ns

@@ -33,8 +33,8 @@ Place = tuple[int, int]
 class Sorter:
     """Sort items by their places, with a bounded delay.
 
-    A camera's frame may arrive after the odometry of its time, so a measurement is held until one
-    newer by `latency_ns` has arrived. Its number depends on the order of the calls alone.
+    A camera's frame may arrive after the odometry of its time, so an item is held until one newer
+    by `latency_ns` has arrived. Its number depends on the order of the calls alone.
     """
 
     def __init__(self, latency_ns: int) -> None:
@@ -95,11 +95,11 @@ class Journal:
     """One robot's file, open for appending (`open_journal`). Any thread may read.
 
     incarnation: the one in progress; 0: none. delivered: every receiver has all of it. calls:
-    offsets of all records but marks, in order of arrival. driven_ns, pose: end of the last odometry
-    interval, and the odometry pose there. cut: number of bytes behind the last whole record;
-    is_damaged: they are no incomplete record. clock: the wall clock at the last mark. team: "" in
-    files of earlier versions. start: pose and covariance of the first incarnation, as in an
-    `InitialPose`. run: the team's run that receives the stream; "": none is known.
+    offsets of all records but marks. driven_ns, pose: end of the last odometry interval, and the
+    odometry pose there. cut: bytes behind the last whole record; is_damaged: they are no incomplete
+    record. clock: the wall clock at the last mark. team: "" in files of earlier versions. start:
+    pose and covariance of the first incarnation. run: the team's run that receives the stream; "":
+    none is known.
     """
 
     path: Path
@@ -189,7 +189,7 @@ class Journal:
         incarnation: int | None = None,
         delivered: bool = False,
     ) -> None:
-        """Append the stream's state and number all waiting measurements.
+        """Append the stream's state, and number all waiting measurements.
 
         incarnation: number of the first incarnation of an empty file.
         """
@@ -265,8 +265,8 @@ class Journal:
         self.cut, self._size = end - at, at
 
     def cut_off(self) -> str:
-        """Remove the bytes behind the last whole record, with a copy if damaged; return a
-        description.
+        """Remove the bytes behind the last whole record; return a description. A damaged end is
+        copied.
         """
         if not self.cut:
             return ""
@@ -289,12 +289,11 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
 def open_journal(
     path: Path, robot: str, latency_ns: int, team: str = "", start: Start = (b"", b"")
 ) -> tuple[Journal, str, str]:
-    """Open a robot's journal for appending; return it with a description of the stream that it
-    continues or has delivered, and one of a stream that is set aside undelivered.
+    """Open a robot's journal; return it with a description of the stream that it continues or has
+    delivered, and one of a stream that is set aside undelivered.
 
     A stream that is delivered, that has not grown for OLD_S, or that is of another team or start is
-    set aside (`replace_journal`). Raises JournalError for a file of another robot, of no driver, or
-    in use.
+    set aside. Raises JournalError for a file of another robot, of no driver, or in use.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _lock_file(path, robot)
@@ -331,8 +330,7 @@ def open_journal(
 def _why_not_continued(journal: Journal, team: str, start: Start, age_s: float) -> str:
     """Reason not to continue the stream of an open file; empty: it is continued.
 
-    A start matters in a stream with measurements, a team that an earlier version did not store in
-    none. age_s: of a stream that is too old, else 0.
+    age_s: of a stream that is too old, else 0.
     """
     if journal.delivered:
         return "has ended"
@@ -352,8 +350,9 @@ def _why_not_continued(journal: Journal, team: str, start: Start, age_s: float) 
 def replace_journal(
     journal: Journal, why: str, latency_ns: int, team: str, start: Start
 ) -> tuple[Journal, str]:
-    """Rename the file of an open journal, and begin an empty one with the next incarnation; return
-    it with a description. why: the reason, after "its stream".
+    """Rename the file of an open journal, and begin an empty one with the next incarnation.
+
+    Returns it with a description. why: the reason, after "its stream".
     """
     journal.close()
     aside = _set_aside(journal.path)
@@ -371,7 +370,6 @@ def _name_start(start: Start) -> str:
 
 
 def _read_whole(journal: Journal) -> bool:
-    """Read an open file; return False for an empty one. Raises JournalError."""
     found = _head_of(journal)
     if found is not None:
         journal.first_incarnation, journal._size = found
@@ -415,9 +413,8 @@ def _lock_file(path: Path, robot: str) -> Journal:
 
 
 def _head_of(journal: Journal) -> tuple[int, int] | None:
-    """Return the first incarnation in a file's head, and the head's length; None: an empty file.
-
-    A crash may leave a part of the head and zeros. Raises JournalError for any other file.
+    """Return the first incarnation in a file's head, and the head's length; None: an empty file, or
+    one with a part of the head and zeros, as after a crash.
     """
     begin = os.pread(journal._file, 4096, 0)
     unpacker = msgpack.Unpacker()

@@ -39,10 +39,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class Link:
-    """Run a source's node on a bus of its own.
-
-    lock: guards writes to the journal.
-    """
+    """Run a source's node on a bus of its own; `lock` guards writes to the journal."""
 
     def __init__(
         self,
@@ -74,9 +71,9 @@ class Link:
     def open(self, patience_s: float) -> str:
         """Start the thread and wait for the router; raises BusError or KeysError after patience_s.
 
-        patience_s = 0: log the first failure; a stream that a run has received waits for the first
-        attempt, since another run does not continue it. Returns a description of a stream that is
-        set aside so, or an empty text.
+        0: log the first failure; a stream that a run has received waits for the first attempt,
+        since another run does not continue it. Returns a description of a stream that is set aside,
+        or "".
         """
         self._unheard = not patience_s
         self._attempt_s = patience_s or ATTEMPT_S
@@ -193,7 +190,6 @@ class Link:
             self._serve(shell, bus)
 
     def _claim_name(self, bus: ZenohBus) -> None:
-        """Wait until no other driver of this robot is present; raises BusError after a while."""
         deadline = time.monotonic() + SECOND_PATIENCE_S
         while bus.is_alive(self._name):
             if time.monotonic() >= deadline or self._leaving.wait(0.5):

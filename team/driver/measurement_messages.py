@@ -23,10 +23,7 @@ LARGEST_SIGMA_RAD = 0.5
 
 
 class MeasurementError(ValueError):
-    """A value cannot be a measurement; the text names it, its place and the remedy.
-
-    The whole call is refused.
-    """
+    """A value cannot be a measurement, and the call is refused; the text has place and remedy."""
 
 
 class DriverWarning(UserWarning):

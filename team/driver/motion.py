@@ -21,9 +21,9 @@ Pose = tuple[float, float, float]
 class Odometer:
     """State of the odometry: end of the last interval, and the odometry pose there if given.
 
-    speeds: forward [m/s] and yaw rate [rad/s] of the last interval. gap_ns: time before it without
-    odometry. home: first pose. steps, fastest: number of intervals and their highest speed [m/s].
-    rates: (ahead, left, turn) per second of the last one.
+    speeds: forward [m/s] and yaw rate [rad/s] of the last interval; rates: its (ahead, left, turn)
+    per second. gap_ns: time before it without odometry. home: first pose. steps, fastest: number of
+    intervals and their highest speed [m/s].
     """
 
     robot: str
@@ -40,8 +40,6 @@ class Odometer:
     def until(self, stamp_ns: int, duration_ns: int | None, call: str) -> int | None:
         """Return the length [ns] of the interval that ends now; None: the first, without a
         duration.
-
-        It begins where the last one ended, within clock jitter.
         """
         end_ns, what = self.end_ns, self._what(call, stamp_ns)
         self.gap_ns = 0
@@ -94,9 +92,7 @@ class Odometer:
             self.speeds = step[0] * 1e9 / duration_ns, step[2] * 1e9 / duration_ns
 
     def was_reset(self, step: Pose, duration_ns: int, pose: Pose) -> bool:
-        """Return whether the odometry was reset: a jump back to its first pose, or a step
-        RESET_TIMES as fast as the fastest one.
-        """
+        """Return whether the odometry jumps to its first pose, or RESET_TIMES as fast as ever."""
         way, usual_m = float(np.hypot(*step[:2])), max(self.fastest, USUAL_M_S) * duration_ns * 1e-9
         home = pose == self.home and way > 2.0 * usual_m
         known = self.steps >= LEAST_STEPS and way > RESET_M

@@ -32,10 +32,9 @@ class SourceNode:
     """Call `begin`, then `publish` and `handle` in turn until `finished`.
 
     An incarnation is published once the robot has consumed the one before. delivered, recorded:
-    progress of the robot and the recorder. done: incarnation, measurements and submaps of the
-    robot's `Done`. joined: incarnation and submaps acknowledged by the centre. is_peer: the robot
-    keeps a set of its own. concluded: it has its final map. models: the robot's announced
-    configuration.
+    progress of robot and recorder. done: incarnation, measurements and submaps of the robot's
+    `Done`. joined: incarnation and submaps acknowledged by the centre. is_peer: the robot keeps a
+    set of its own. concluded: it has its final map. models: the robot's announced configuration.
     """
 
     journal: Journal
@@ -104,9 +103,7 @@ class SourceNode:
     """Channels of the team's results, for a program that has subscribed to them."""
 
     def begin(self) -> list[Outgoing]:
-        """Publish the saved maps, and the stream's initial pose and head, for receivers that missed
-        them.
-        """
+        """Publish the saved maps, and the stream's initial pose and head, for late receivers."""
         maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self.maps]
         if not self._incarnation:
             return maps
@@ -123,7 +120,6 @@ class SourceNode:
         return out
 
     def _next(self) -> int | None:
-        """Return the number of the next measurement; may begin the next incarnation."""
         if self._published < self.journal.count(self._incarnation):
             return self._published
         if self._incarnation == self.journal.incarnation:
@@ -173,10 +169,7 @@ class SourceNode:
         return self._has_credit and self._published < self.journal.count(self._incarnation)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Return the reason to refuse a message that claims more than was numbered; None: accepted.
-
-        The robot's first progress may belong to another file.
-        """
+        """Return why to refuse a message that claims more than was numbered; None: accepted."""
         refused = absurd(message)
         if refused is not None or not isinstance(message, m.Progress | m.Done):
             return refused

@@ -1,7 +1,7 @@
-"""A team's certificate authority and the certificates that it issues.
+"""A team's certificate authority and the certificates that it issues, on curve P-256.
 
-Keys are on curve P-256. A certificate names node (CN) and team (O), the router's also its hosts.
-Node certificates are for clients only. Validity begins an hour early, since robot clocks differ.
+A certificate names node (CN) and team (O), the router's also its hosts. Validity begins an hour
+early, since robot clocks differ.
 """
 
 import os
@@ -55,10 +55,10 @@ def make_keys(
     revoke: Sequence[str] = (),
     now: datetime | None = None,
 ) -> Made:
-    """Create a missing authority and missing certificates in the folder.
+    """Create a missing authority and missing certificates in the folder; raises KeysError.
 
     renew: nodes that get a new key and certificate under the same name. revoke: nodes whose name
-    the router no longer accepts. Raises KeysError.
+    the router no longer accepts.
     """
     now = now or datetime.now(UTC)
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)

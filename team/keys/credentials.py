@@ -55,10 +55,7 @@ class Credentials:
 def credentials_of(
     folder: Path, node: str, team: str | None = None, now: datetime | None = None
 ) -> Credentials:
-    """Load and check a node's files; raises KeysError with defect and remedy.
-
-    team: required team; None: any.
-    """
+    """Load and check a node's files of a team (None: any); raises KeysError with the remedy."""
     paths = folder / CA, folder / f"{node}.pem", folder / f"{node}.key"
     for path in paths:
         if not path.is_file():

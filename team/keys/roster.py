@@ -32,11 +32,7 @@ class Issued(NamedTuple):
 
 
 class Roster(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Contents of the roster file.
-
-    nodes: certificate generation by node. hosts: of the router. revoked: last revoked generation by
-    node.
-    """
+    """The roster file: certificate generations, hosts of the router, last revoked generations."""
 
     team: str
     nodes: dict[str, int]

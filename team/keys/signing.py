@@ -19,10 +19,9 @@ _ALGORITHM = ec.ECDSA(hashes.SHA256())
 
 
 class Signer:
-    """Sign as one node, and verify certificates issued by the team's authority.
+    """Sign as one node, and verify certificates issued by the team's authority; raises KeysError.
 
     certificate: the node's own, DER. Revocations are read from a roster beside the node's files.
-    Raises KeysError.
     """
 
     def __init__(self, own: Credentials) -> None:

@@ -34,9 +34,8 @@ class Finding(NamedTuple):
 
 
 def check_log(log: Log) -> list[Finding]:
-    """Find all defects of file, schemas, counters and messages.
-
-    Memory: 16 bytes a message, and one chunk.
+    """Find all defects of file, schemas, counters and messages, in 16 bytes a message and one
+    chunk.
     """
     found = _of_file(log)
     evidence = _evidence(log)
@@ -196,10 +195,7 @@ def _unsound(sample: Sample) -> str | None:
 
 
 def find_misdeclaration(key: str, of: Declared) -> str | None:
-    """Return the defect of a key's declaration, or None.
-
-    Later versions may append fields: the shorter field list must be a prefix of the longer.
-    """
+    """Return the defect of a key's declaration, or None; later versions may append fields."""
     row = ch.channel_of(key)
     if row is None:
         return None if ch.VIEW.owner(key) is not None else "no channel has this key"

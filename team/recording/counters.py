@@ -1,7 +1,6 @@
 """Counters of one key: missing and duplicate publications of a log.
 
-A publisher counts its publications on a key from 0, and from 0 again after a restart. A life is the
-publications of one process.
+A publisher counts its publications on a key from 0. A life is the publications of one process.
 """
 
 from array import array
@@ -40,8 +39,8 @@ class Counters:
     ) -> list[str]:
         """Find defects, one line each.
 
-        part: the log is a cut, so earlier publications are not missing. numbered: messages have
-        their own numbers. totals: publishers' final counts.
+        part: earlier publications, before a cut, are not missing. numbered: messages have their own
+        numbers. totals: publishers' final counts.
         """
         counters, walls = self._arrays()
         order = np.lexsort((walls, counters))
@@ -100,9 +99,7 @@ def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"
 
 
 def _by_arrival(counters: Int64[np.ndarray, " n"]) -> list[Life]:
-    """Split by arrival: a counter that the newest life has belongs to the latest earlier life that
-    lacks it, or begins the next.
-    """
+    """Split by arrival: a counter of the newest life belongs to the latest one that lacks it."""
     present = [IntervalSet()]
     places: list[list[int]] = [[]]
     for place, counter in enumerate(counters.tolist()):

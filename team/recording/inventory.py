@@ -34,10 +34,7 @@ class _Run:
 
 
 class Received:
-    """Received counters of each key that its publisher caches, by publishing process.
-
-    Consecutive samples of a process form a run; a gap filled later is another run.
-    """
+    """Received counters of each key that its publisher caches, in runs of one process."""
 
     def __init__(self) -> None:
         self._runs: dict[str, list[_Run]] = defaultdict(list)
@@ -103,10 +100,7 @@ class NumberedStream(NamedTuple):
 
 @dataclass
 class Numbered:
-    """Present numbers of a stream, each with a payload checksum.
-
-    newest: last known number. Memory: 4 bytes per number without a gap before it, more for others.
-    """
+    """Present numbers of a stream, each with a payload checksum; newest: the last known number."""
 
     newest: int = -1
     count: int = 0
@@ -152,10 +146,7 @@ class Numbered:
 
 @dataclass
 class Inventory:
-    """Numbered streams of a log, sample by sample.
-
-    has_earlier_parts: earlier parts exist, whose messages may be repeated.
-    """
+    """Numbered streams of a log, sample by sample; earlier parts' messages may be repeated."""
 
     has_earlier_parts: bool = False
     streams: dict[NumberedStream, Numbered] = field(default_factory=dict)

@@ -23,12 +23,11 @@ class Merged(NamedTuple):
 
 
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
-    """Write each sample once to a new log `out`, in order of team time.
+    """Write each sample once to a new log `out`, in order of team time, all in memory at once.
 
     Samples of equal key, counter, wall clock and payload are one publication; measurements, submaps
-    and inter-robot measurements are compared by content. All samples are in memory at once. Raises
-    `LogError`, before creating `out`, for logs of different teams or a damaged one; `RecorderError`
-    if `out` exists.
+    and inter-robot measurements are compared by content. Raises `LogError`, before creating `out`,
+    for logs of different teams or a damaged one; `RecorderError` if `out` exists.
     """
     first = logs[0]
     for log in logs[1:]:
@@ -43,10 +42,7 @@ def merge(logs: Sequence[Log], out: str | Path) -> Merged:
 
 
 def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
-    """Merge metadata: entries on which all logs agree, the others as `name@file`.
-
-    With equal file names: `name@1:file`.
-    """
+    """Merge metadata: entries on which all logs agree, others as `name@file`, `name@1:file`."""
     files = [log.path.name for log in logs]
     if len(set(files)) < len(files):
         files = [f"{i}:{file}" for i, file in enumerate(files, 1)]

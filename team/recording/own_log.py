@@ -17,10 +17,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class OwnLog:
-    """Write samples once each, and list messages lost in a crash: a bus's `Tap`.
-
-    failed: writing failed and was reported.
-    """
+    """Write samples once each, until a write fails, and list lost ones: a bus's `Tap`."""
 
     def __init__(self, recorder: Recorder, inventory: Inventory) -> None:
         self._recorder = recorder
@@ -56,8 +53,8 @@ class OwnLog:
 def own_log(path: Path, team: str) -> Iterator[OwnLog]:
     """Write samples to a log within a context; after a restart, to a further part.
 
-    A write error is reported and the log abandoned; the process continues. Raises `RecorderError`
-    if no log can be created at `path`.
+    A write error is reported, and the process continues. Raises `RecorderError` if no log can be
+    created.
     """
     recorder, inventory = next_part(path, team, {**provenance(), OWN: path.name})
     own = OwnLog(recorder, inventory)

@@ -1,7 +1,7 @@
 """A log in parts: a restarted recorder continues in a further file.
 
-At the end of a run the parts are joined into `log.mcap`, unless the disk is full. The joined log
-replaces the first part in one step, so a crash neither loses nor repeats samples.
+At the end of a run the parts are joined, unless the disk is full. The joined log replaces the first
+part in one step, so a crash neither loses nor repeats samples.
 """
 
 import os
@@ -88,7 +88,7 @@ def _is_over(log: Log, ends: Sequence[Channel]) -> bool:
 def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recorder, Inventory]:
     """Open a recorder for the next part; return it with the inventory of the earlier ones.
 
-    Raises `RecorderError` for a full disk or an uncreatable file.
+    Raises `RecorderError`.
     """
     for each in joined_leftovers(path):
         each.unlink()
@@ -119,10 +119,7 @@ def inventory_of(parts: Sequence[Path]) -> Inventory:
 
 
 def join_parts(path: Path) -> list[Path]:
-    """Join a log's parts; return the remaining files, one on success.
-
-    Undamaged chunks are copied in order of arrival. A full disk changes nothing.
-    """
+    """Join a log's parts by copying whole chunks; return the remaining files, one on success."""
     for each in joined_leftovers(path):
         each.unlink()
     whole = path.with_name(path.name + JOINING)

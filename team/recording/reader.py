@@ -56,9 +56,8 @@ class Declared(NamedTuple):
 
 @dataclass
 class Channels:
-    """Declarations of one file so far: the key of each channel (None: not read), and schemas.
-
-    names: of the channels to read; None: all.
+    """Keys and schemas that one file has declared so far; names: of the channels to read; None:
+    all.
     """
 
     names: set[str] | None = None

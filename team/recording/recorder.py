@@ -37,10 +37,7 @@ class RecorderError(RuntimeError):
 
 
 class Recorder:
-    """Write one log on a thread, whose errors are raised by the next call.
-
-    Raises `RecorderError` if the file cannot be created or exists.
-    """
+    """Write one log on a thread, whose errors are raised by the next call, as `RecorderError`."""
 
     def __init__(self, path: str | Path, team: str, metadata: Mapping[str, str]) -> None:
         self.path = Path(path)
@@ -125,7 +122,6 @@ class Recorder:
                 flushed, unflushed = time.monotonic(), False
 
     def _bound_chunk(self, sample: Sample) -> None:
-        """End the chunk before it spans more than CHUNK_NS of wall time."""
         first, last = self._span
         first, last = min(first, sample.wall_ns), max(last, sample.wall_ns)
         if self._in_chunk >= CHUNK_LEAST and last - first > CHUNK_NS:

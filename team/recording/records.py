@@ -1,7 +1,4 @@
-"""Read an MCAP file's records as untrusted input.
-
-Every length and chunk CRC is checked before use.
-"""
+"""Read an MCAP file's records as untrusted input: lengths and CRCs are checked before use."""
 
 import os
 import struct
@@ -73,9 +70,9 @@ def read_index(file: IO[bytes], path: Path) -> Iterator[Frame]:
 
 
 def check_index(file: IO[bytes]) -> str | None:
-    """Return the defect of a complete file's index; None if its CRC fits.
+    """Return the defect of a complete file's index; None if its CRC fits or none was written.
 
-    The CRC spans the summary section and the footer up to the CRC itself; 0: none was written.
+    The CRC spans the summary section and the footer up to the CRC itself.
     """
     end = file.seek(-FOOTER_SIZE - len(MCAP0_MAGIC), os.SEEK_END)
     footer = file.read(FOOTER_SIZE)
@@ -95,8 +92,7 @@ def check_index(file: IO[bytes]) -> str | None:
 def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
     """Yield whole records of the file from `start`, up to a truncated one.
 
-    After invalid bytes, whose length or the one before is damaged, reading continues at the next
-    chunk found.
+    Behind invalid bytes reading continues at the next chunk found.
     """
     size = os.fstat(file.fileno()).st_size
     if start > size:
@@ -140,9 +136,7 @@ def _next_chunk(file: IO[bytes], start: int, size: int) -> int | None:
 
 
 def locate_records(data: bytes) -> list[tuple[int, int, int]]:
-    """Return opcode, first and last byte of each record of an expanded chunk; raises ValueError if
-    one exceeds it or there are too many.
-    """
+    """Return opcode, first and last byte of each record of an expanded chunk; raises ValueError."""
     found: list[tuple[int, int, int]] = []
     offset, size, head = 0, len(data), _FRAME.size
     unpack, most = _FRAME.unpack_from, MOST_RECORDS

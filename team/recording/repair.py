@@ -39,10 +39,9 @@ def read_undamaged(log: Log, damaged: list[str]) -> Iterator[Sample]:
 
 
 def repair_log(path: str | Path, out: str | Path) -> Report:
-    """Copy every undamaged chunk of a log to a new, complete log `out`.
+    """Copy every undamaged chunk of a log to a new, complete log `out`, noted if it was unfinished.
 
-    Metadata is copied, with a note for an unfinished log. Raises `LogError` if `path` is no log,
-    `RecorderError` if `out` exists.
+    Raises `LogError` if `path` is no log, `RecorderError` if `out` exists.
     """
     log = open_log(path)
     messages, until_ns = 0, None
@@ -69,7 +68,7 @@ class BagReport(NamedTuple):
 def repair_bag(path: Path, out: Path) -> BagReport:
     """Copy the messages of an MCAP file's whole chunks to a new file with an index.
 
-    Raises LogError, without a new file, if `path` is no MCAP file or has no whole message.
+    Raises LogError, without a new file, if it has no whole message.
     """
     damaged: list[str] = []
     messages = 0
@@ -113,7 +112,6 @@ def repair_bag(path: Path, out: Path) -> BagReport:
 
 
 def _records(reader: StreamReader, damaged: list[str]) -> Iterator[McapRecord]:
-    """Yield records in order, including those in chunks; damage is noted in `damaged`."""
     records = reader.records
     while True:
         try:

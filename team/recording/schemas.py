@@ -30,9 +30,8 @@ class Declaration(NamedTuple):
 
 
 def declaration_of(key: str, tag: str = "") -> Declaration | None:
-    """Return the declaration of a relative key; None for a key without a row in the table.
-
-    tag: the message's, if the key has several types.
+    """Return the declaration of a relative key, for a message's tag if it has several; None: no
+    row.
     """
     found = channel_of(key)
     if found is not None:

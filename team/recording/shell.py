@@ -57,7 +57,7 @@ class RecordLoop:
     """Write each bus sample once, request missing ones, and report progress.
 
     expected: nodes whose absence is a warning. inventory: of earlier parts. more: opens the next
-    part after a write error; without it the error is raised. peers: recording ends when each has
+    part after a write error, which is raised without it. peers: recording ends when each has
     concluded, or was given up or withdrawn. The centre's final map ends any team.
     """
 
@@ -304,8 +304,8 @@ class RecordLoop:
         return status
 
     def run(self, stop: threading.Event, scenario: Sequence[m.Configuration] = ()) -> int:
-        """Record until the final map is present and all nodes have left, or until `stop`; return
-        the number of messages written.
+        """Record until the final map is there and all nodes have left, or `stop`; count the
+        messages.
 
         scenario: configurations logged for a team without a world. Raises `RecorderError` on a
         write error: at once without `more`, else at the end.
@@ -340,10 +340,7 @@ class RecordLoop:
 
 
 def replay(bus: Bus, samples: Iterable[Sample], speed: float, stop: threading.Event) -> int:
-    """Publish samples unchanged at `speed` × team time until done or `stop`; return their number.
-
-    Due times are relative to the first sample, so delays do not accumulate.
-    """
+    """Publish samples unchanged at `speed` × team time until `stop`; return their number."""
     due = time.monotonic()
     published = 0
     for delay, sample in schedule(samples, speed):

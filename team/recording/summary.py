@@ -45,10 +45,7 @@ class Summary(NamedTuple):
     damaged: tuple[str, ...]
 
     def span_ns(self) -> tuple[int, int] | None:
-        """Return the team time of the first and last measurement, else of any message.
-
-        Configurations are stamped zero, long before a data set's measurements.
-        """
+        """Return the team time of the first and last measurement, else of any message."""
         sensors = {channel.name for channel in SENSORS}
         chosen = [each for each in self.keys if each.channel in sensors] or self.keys
         if not chosen:

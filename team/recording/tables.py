@@ -116,10 +116,7 @@ GROUP_BYTES = 32 * 2**20
 
 
 class ParquetTable:
-    """One channel's Parquet file, written by row group, so memory is bounded.
-
-    Raises ImportError without pyarrow.
-    """
+    """One channel's Parquet file, written by row group; raises ImportError without pyarrow."""
 
     def __init__(self, path: Path, kind: type[Message]) -> None:
         import pyarrow as pa
@@ -162,10 +159,7 @@ def export_tables(
     channels: Collection[Channel] | None = None,
     form: type[CsvTable] | type[ParquetTable] = CsvTable,
 ) -> Exported:
-    """Write a table for each non-empty channel (None: all) into `folder`.
-
-    Raises `LogError` for a damaged log, OSError for an unwritable folder.
-    """
+    """Write a table for each non-empty channel (None: all); raises `LogError` or OSError."""
     folder.mkdir(parents=True, exist_ok=True)
     exported, ending = Exported(), "csv" if form is CsvTable else "parquet"
     with ExitStack() as files:
@@ -185,7 +179,6 @@ def export_tables(
 
 
 def _arrow_type(pa: Any, name: str, kind: object) -> Any:
-    """Return the column type of a field, by the class under its annotation's bounds."""
     of = getattr(kind, "__origin__", kind)
     if of is bytes and kind != Digest:
         return pa.list_(pa.from_numpy_dtype(type_of_numbers(name)))

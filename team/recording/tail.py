@@ -18,7 +18,7 @@ MOST = 20_000
 class Tail:
     """Read a log that may grow or not exist yet; each sample is returned once.
 
-    log: set once it exists. ended: finished and fully read. damaged: number of unreadable chunks.
+    ended: finished and fully read. damaged: number of unreadable chunks.
     """
 
     path: Path

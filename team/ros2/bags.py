@@ -64,9 +64,7 @@ class Bag:
         return sorted(found)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Yield the messages of these topics in order of arrival; raises BagError for a damaged
-        bag.
-        """
+        """Yield the messages of these topics in order of arrival; raises BagError."""
         chosen = [c for c in self._reader.connections if c.topic in topics]
         if not chosen:
             return

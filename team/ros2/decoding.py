@@ -1,7 +1,4 @@
-"""Decode a ROS 2 message (type, CDR bytes) into a frozen record.
-
-Undecodable bytes, and numbers that are not finite, raise `DamagedError`.
-"""
+"""Decode a ROS 2 message (type, CDR bytes) into a frozen record of finite numbers."""
 
 from collections.abc import Callable, Iterable, Mapping
 from math import isfinite
@@ -64,9 +61,10 @@ class Transform(NamedTuple):
 
 
 class Tag(NamedTuple):
-    """One detected tag: its name and its position; covariance: of (x, y, z), row-major.
+    """One detected tag.
 
-    kind: its class by the detector, where that is not its name.
+    covariance: of (x, y, z), row-major. kind: its class by the detector, where that is not its
+    name.
     """
 
     name: str
@@ -109,9 +107,9 @@ FAULTS = (SerdeError, ValueError, IndexError, KeyError, OverflowError, MemoryErr
 
 
 def decode(kind: str, data: bytes | memoryview, store: Typestore | None = None) -> Record:
-    """Decode a message of this type (`nav_msgs/msg/Odometry`); raises DamagedError.
+    """Decode a message of a type in READERS (`nav_msgs/msg/Odometry`); raises DamagedError.
 
-    store: the types' definitions, if they are not ours. A type that READERS lacks is a KeyError.
+    store: the types' definitions, if they are not ours.
     """
     reader = READERS[kind]
     try:

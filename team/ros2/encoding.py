@@ -31,11 +31,7 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Names:
-    """Topics and frames of one robot.
-
-    namespace: begins the robot's topics, as `/alpha`. tf: topic of the transforms. map_frame,
-    odometry_frame, base_frame: as in REP 105.
-    """
+    """Topics and frames of one robot; its topics begin with the namespace, frames as in REP 105."""
 
     namespace: str
     tf: str = "/tf"

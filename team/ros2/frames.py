@@ -86,10 +86,7 @@ OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 
 @dataclass
 class Frames:
-    """Static transforms: each frame's pose in its parent.
-
-    moving: the parents of frames whose transforms may change.
-    """
+    """Static transforms: each frame's pose in its parent; moving: parents that may change."""
 
     parents: dict[str, Transform] = field(default_factory=dict)
     moving: dict[str, str] = field(default_factory=dict)
@@ -113,8 +110,7 @@ class Frames:
     ) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
         """Return rotation and translation from a frame to the base; None without a chain.
 
-        The chain goes up to the base, or to a common ancestor: base_from_frame =
-        ancestor_from_base⁻¹ ancestor_from_frame.
+        By a common ancestor: base_from_frame = ancestor_from_base⁻¹ ancestor_from_frame.
         """
         ours, theirs = self._ancestors(frame), self._ancestors(base)
         for ancestor, (rotation, moved) in ours.items():
@@ -128,9 +124,7 @@ class Frames:
     def _ancestors(
         self, frame: str
     ) -> dict[str, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-        """Return the frame and its ancestors, each with the rotation and translation from the
-        frame.
-        """
+        """Return the frame and its ancestors, with rotation and translation to each."""
         rotation, moved = np.eye(3), np.zeros(3)
         found = {frame: (rotation, moved)}
         while frame in self.parents and len(found) < DEEPEST:

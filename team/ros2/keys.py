@@ -56,10 +56,7 @@ def _in_spaces(odometry: str, name: str) -> set[str]:
 
 
 class Publication(NamedTuple):
-    """Keys of one topic that we publish, and the liveliness tokens that announce it.
-
-    rmw, bridge: keys for subscribers by rmw_zenoh and behind zenoh-bridge-ros2dds.
-    """
+    """Keys for subscribers by rmw_zenoh and behind the bridge, and tokens of the topic."""
 
     rmw: str
     bridge: str

@@ -103,10 +103,7 @@ def check_semidefinite(data: Floats, n: int, what: str) -> None:
 
 
 def landmark_blocks(covariance: bytes, count: int, *, joint: bool) -> "np.ndarray":
-    """Extract the 2 × 2 covariance of each landmark [m²], (count, 2, 2).
-
-    joint: the bytes are the packed upper triangle of all, else packed blocks.
-    """
+    """Extract the 2 × 2 covariances of landmarks [m²] from a packed joint triangle, or blocks."""
     values = floats(covariance, "covariance").astype(np.float64)
     if joint:  # row i of a packed upper triangle of n rows begins at i·n − i(i − 1)/2
         n = 2 * count

@@ -85,9 +85,7 @@ class Bus(Protocol):
     dropped: int
 
     def publish(self, out: Outgoing) -> int:
-        """Publish a message, blocking while receivers are slower; return the payload's size
-        [bytes].
-        """
+        """Publish, blocking while receivers are slower; return the payload's size [bytes]."""
 
     def publish_raw(self, sample: Sample) -> None:
         """Publish a logged sample again, unchanged."""
@@ -105,10 +103,7 @@ class Bus(Protocol):
         """Answer the queries of `channel` for one name, or `*`; a ValueError's text is a reply."""
 
     def ask(self, channel: Channel, name: str, request: m.Message, timeout_s: float) -> list[bytes]:
-        """Query; return the payloads of the replies in order, none without an answer.
-
-        Raises `BusError` on an error.
-        """
+        """Query; return the replies' payloads in order, perhaps none; raises `BusError`."""
 
     def request(self, channel: Channel, name: str, request: m.Message) -> None:
         """Send a query, unless the same one is open; `receive` returns the replies."""
@@ -279,10 +274,7 @@ class MemoryNetwork:
 
 
 class MemoryBus(Bus):
-    """A bus within one process: synchronous and deterministic; its wall clock is always zero.
-
-    arrived: the samples that `receive` will return.
-    """
+    """A bus within one process: synchronous and deterministic; its wall clock is always zero."""
 
     def __init__(self, network: MemoryNetwork) -> None:
         self.dropped = 0

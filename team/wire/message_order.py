@@ -42,10 +42,7 @@ def is_newer_map(new: m.FusedMap, known: m.FusedMap | None) -> bool:
 
 
 def merge_progress(new: m.Progress, known: m.Progress | None) -> m.Progress:
-    """Return the larger numbers of both messages, or the message of the newer incarnation.
-
-    A restarted process first reports smaller numbers.
-    """
+    """Return the larger numbers of both, since a restarted process first reports smaller ones."""
     if known is None or new.incarnation > known.incarnation:
         return new
     if new.incarnation < known.incarnation:

@@ -212,10 +212,7 @@ class ZenohBus:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribe to a channel; repetition has no effect.
-
-        whole: for a `latest` channel all samples that its publishers still have.
-        """
+        """Subscribe once; whole: all samples that a `latest` channel's publishers still have."""
         self._check_open()
         if {(channel.name, "*"), (channel.name, name)} & self._requested:
             return
@@ -326,8 +323,8 @@ class ZenohBus:
         self._recovery.redeliver()
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return the missing samples, available or not, as intervals of a publisher's counters by
-        key.
+        """Return the missing samples, available or not: by key, intervals of a publisher's
+        counters.
         """
         return self._recovery.find_missing()
 
@@ -347,9 +344,9 @@ class ZenohBus:
         )
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """Query and return the replies' payloads in order; empty when nobody answers.
+        """Query and return the replies' payloads in order; raises `BusError`.
 
-        Raises `BusError` for an error or timeout. Meanwhile this bus answers no queries.
+        Meanwhile this bus answers no queries.
         """
         self._check_open()
         key = self._prefix + channel.key(name)

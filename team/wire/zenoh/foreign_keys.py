@@ -114,10 +114,7 @@ class ForeignKeys:
     def publish(
         self, key: str, payload: bytes, attachment: bytes | None = None, *, latched: bool = False
     ) -> None:
-        """Publish on a key; a late subscriber receives a latched one's newest sample.
-
-        A message that a slow network cannot take is dropped.
-        """
+        """Publish, dropped by a slow network; late subscribers receive a latched message."""
         publisher = self._publishers.get(key)
         if publisher is None:
             drop = zenoh.CongestionControl.DROP

@@ -48,10 +48,7 @@ class Heartbeat:
 
 @dataclass
 class CacheAnswer:
-    """Complete reply of a publisher's cache to one request.
-
-    known: the publisher's last number at the request. newest: that of the reply.
-    """
+    """Reply of a publisher's cache to a request, when its last number was `known`."""
 
     key: str
     publisher: str
@@ -224,8 +221,8 @@ class Recovery:
         }
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return the missing samples, available or not, as intervals of a publisher's counters by
-        key.
+        """Return the missing samples, available or not: by key, intervals of a publisher's
+        counters.
         """
         found: dict[str, list[tuple[int, int]]] = {}
         for (key, _), arrivals in sorted(self._arrivals.items()):
