@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from teamslam.central.main import CentralShell
     from teamslam.central.peers.main import CentreShell, PeerShell
     from teamslam.team.config import RobotConfig
-    from teamslam.team.recording.own_log import OwnLog
+    from teamslam.team.recording.parts import OwnLog
     from teamslam.team.wire.bus import Bus
     from teamslam.team.wire.channels import Channel
     from teamslam.team.wire.messages import SavedMap
@@ -186,7 +186,7 @@ def robot(
 def _own_log(log: Path | None, scenario: Scenario) -> AbstractContextManager["OwnLog | None"]:
     if log is None:
         return nullcontext()
-    from teamslam.team.recording.own_log import own_log
+    from teamslam.team.recording.parts import own_log
 
     return own_log(log, scenario.team)
 

@@ -99,7 +99,7 @@ def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"
 
 
 def _by_arrival(counters: Int64[np.ndarray, " n"]) -> list[Life]:
-    """Split by arrival: a counter of the newest life belongs to the latest one that lacks it."""
+    """Split by arrival: a repeated counter belongs to the latest life that lacks it."""
     present = [IntervalSet()]
     places: list[list[int]] = [[]]
     for place, counter in enumerate(counters.tolist()):

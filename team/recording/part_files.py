@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -85,33 +85,31 @@ def part_of(path: Path, number: int) -> Path:
     return path if number == 1 else path.with_name(f"{path.stem}.part{number}{path.suffix}")
 
 
-def parts_of(path: Path) -> list[Path]:
-    """Return the files of a log in order, without joined parts and parts of another log."""
+class Parts(NamedTuple):
+    """A log's files, opened if they are logs, leftovers of joined parts, and the next number."""
+
+    opened: dict[Path, LogFile | None]
+    leftovers: list[Path]
+    next_number: int
+
+
+def read_parts(path: Path) -> Parts:
+    """Open the files of a log in order, without joined parts and parts of another log."""
     numbered = _numbered_parts(path)
     opened = {number: open_part(part) for number, part in numbered.items()}
     first = next((log for log in opened.values() if log is not None), None)
     joined = _last_joined(opened.get(1))
-    return [
-        part
-        for number, part in numbered.items()
-        if number == 1 or (number > joined and _is_of(first, opened[number], part))
-    ]
+    own = [n for n, part in numbered.items() if n == 1 or _is_of(first, opened[n], part)]
+    return Parts(
+        {numbered[n]: opened[n] for n in own if n == 1 or n > joined},
+        [numbered[n] for n in own if 1 < n <= joined],
+        max(joined, *numbered) + 1 if numbered else 1,
+    )
 
 
-def next_number(path: Path) -> int:
-    """Return the number of the next part, above all earlier ones."""
-    numbered = _numbered_parts(path)
-    return max((_last_joined(open_part(path)), *numbered)) + 1 if numbered else 1
-
-
-def joined_leftovers(path: Path) -> list[Path]:
-    """Return the leftover files of joined parts."""
-    first = open_part(path)
-    return [
-        part
-        for number, part in _numbered_parts(path).items()
-        if 1 < number <= _last_joined(first) and _is_of(first, open_part(part), part)
-    ]
+def parts_of(path: Path) -> list[Path]:
+    """Return the files of a log in order."""
+    return list(read_parts(path).opened)
 
 
 def _numbered_parts(path: Path) -> dict[int, Path]:

@@ -4,12 +4,13 @@ At the end of a run the parts are joined, unless the disk is full. The joined lo
 part in one step, so a crash neither loses nor repeats samples.
 """
 
+import logging
 import os
 import secrets
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from teamslam.team.recording.inventory import Inventory
@@ -17,16 +18,16 @@ from teamslam.team.recording.part_files import (
     JOINED,
     LOG_ID,
     LogFile,
-    joined_leftovers,
-    next_number,
-    open_part,
+    Parts,
     part_of,
-    parts_of,
+    read_parts,
 )
+from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.reader import Log, LogError, log_of, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.wall_clock import wall_clock, was_set_since
+from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import FINAL_MAP, Channel
 
 LONGEST_AWAY_S = 3600.0
@@ -34,6 +35,9 @@ LONGEST_AWAY_S = 3600.0
 ROOM = 16 * 2**20
 """Bytes to keep free on the disk."""
 JOINING = ".joining"
+OWN = "own_log"
+"""Metadata name that marks a single process's log."""
+_LOG = logging.getLogger("teamslam")
 
 
 def check_continues(
@@ -50,18 +54,18 @@ def check_continues(
     was set. same_run: skips the age test. ends: channels of the maps that end the team. Raises
     `LogError` for any other log.
     """
-    parts = parts_of(path)
+    parts = read_parts(path)
     remedy = "choose another name or remove it"
     log: LogFile | None = None
-    for part in parts:
+    for part, opened in parts.opened.items():
         if part.is_file() and part.stat().st_size == 0:
             continue
-        log = open_part(part)
+        log = opened
         if log is None:
             raise LogError(part, "exists, and is no log of ours", remedy)
         if (log.team, log.metadata.get("scenario")) != (team, metadata.get("scenario")):
             raise LogError(part, "exists, of another team or scenario", remedy)
-    away_s = time.time() - parts[-1].stat().st_mtime
+    away_s = time.time() - part.stat().st_mtime
     if (
         not same_run
         and away_s > LONGEST_AWAY_S
@@ -71,8 +75,8 @@ def check_continues(
         raise LogError(path, what, f"{remedy}; --resume if it is of this run")
     if log is None or not _is_over(open_log(path), ends):
         return True
-    joining = path.with_name(path.name + JOINING).exists() or len(parts) > 1
-    if not (same_run or joining or joined_leftovers(path)):
+    joining = path.with_name(path.name + JOINING).exists() or len(parts.opened) > 1
+    if not (same_run or joining or parts.leftovers):
         raise LogError(path, "exists, with the final map of its run", remedy)
     return False
 
@@ -90,50 +94,48 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
 
     Raises `RecorderError`.
     """
-    for each in joined_leftovers(path):
-        each.unlink()
-    earlier = parts_of(path)
+    parts = _without_leftovers(path)
+    earlier = list(parts.opened)
     if earlier and shutil.disk_usage(path.parent).free < ROOM:
         raise RecorderError(f"{path}: the disk is full; make room")
-    before = next((log for log in map(open_part, earlier) if log is not None), None)
+    before = next((log for log in parts.opened.values() if log is not None), None)
     log_id = secrets.token_hex(8) if before is None else before.metadata.get(LOG_ID)
     named = {} if log_id is None else {LOG_ID: log_id}
-    part = part_of(path, next_number(path))
+    part = part_of(path, parts.next_number)
     try:
         recorder = Recorder(part, team, {**metadata, **wall_clock(), **named})
     except RecorderError:
         if earlier:  # the name was free, so the log is ours
             part.unlink(missing_ok=True)
         raise
-    return recorder, inventory_of(earlier)
-
-
-def inventory_of(parts: Sequence[Path]) -> Inventory:
-    """Return the inventory of these parts without damaged chunks."""
-    inventory = Inventory(has_earlier_parts=bool(parts))
-    for part in parts:
-        file = open_part(part)
+    inventory = Inventory(has_earlier_parts=bool(earlier))
+    for file in parts.opened.values():
         for sample in () if file is None else read_undamaged(log_of([file]), []):
             inventory.remember(sample)
-    return inventory
+    return recorder, inventory
+
+
+def _without_leftovers(path: Path) -> Parts:
+    parts = read_parts(path)
+    for each in parts.leftovers:
+        each.unlink()
+    return parts
 
 
 def join_parts(path: Path) -> list[Path]:
     """Join a log's parts by copying whole chunks; return the remaining files, one on success."""
-    for each in joined_leftovers(path):
-        each.unlink()
+    found = _without_leftovers(path)
     whole = path.with_name(path.name + JOINING)
     whole.unlink(missing_ok=True)
-    parts = parts_of(path)
-    opened = [open_part(part) for part in parts]
-    logs = [log for log in opened if log is not None]
-    unreadable = (p for p, log in zip(parts, opened, strict=True) if log is None)
+    parts = list(found.opened)
+    logs = [log for log in found.opened.values() if log is not None]
+    unreadable = (part for part, log in found.opened.items() if log is None)
     if len(parts) < 2 or not logs or any(part.stat().st_size for part in unreadable):
         return parts
     size = sum(part.stat().st_size for part in parts)
     if shutil.disk_usage(path.parent).free < size + ROOM:
         return parts
-    joined = {JOINED: str(next_number(path) - 1)}
+    joined = {JOINED: str(found.next_number - 1)}
     try:
         with Recorder(whole, logs[0].team, {**logs[0].metadata, **joined}) as recorder:
             for log in logs:
@@ -156,3 +158,53 @@ def _write_through(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+class OwnLog:
+    """Write samples once each, until a write fails, and list lost ones: a bus's `Tap`."""
+
+    def __init__(self, recorder: Recorder, inventory: Inventory) -> None:
+        self._recorder = recorder
+        self._inventory = inventory
+        self.failed = False
+
+    def __call__(self, samples: list[Sample]) -> None:
+        """Write the new samples."""
+        if self.failed:
+            return
+        try:
+            self._recorder.write([sample for sample in samples if self._inventory.is_new(sample)])
+        except RecorderError as error:
+            self.failed = True
+            _LOG.error("its own log is not written any more: %s", error)
+
+    def lost(self, robot: str) -> list[tuple[int, int, int]]:
+        """Return the missing intervals of a robot's measurements (incarnation, first, last).
+
+        A killed process loses unflushed measurements, which its robot will not request again.
+        """
+        if self.failed:
+            return []
+        return [
+            (stream.incarnation, first, last)
+            for stream, found in self._inventory.streams.items()
+            if stream.kind == "measurements" and stream.robot == robot
+            for first, last in found.missing
+        ]
+
+
+@contextmanager
+def own_log(path: Path, team: str) -> Iterator[OwnLog]:
+    """Write samples to a log within a context; after a restart, to a further part.
+
+    A write error is reported, and the process continues. Raises `RecorderError` if no log can be
+    created.
+    """
+    recorder, inventory = next_part(path, team, {**provenance(), OWN: path.name})
+    own = OwnLog(recorder, inventory)
+    try:
+        yield own
+    finally:
+        if not own.failed:
+            recorder.close()
+            join_parts(path)

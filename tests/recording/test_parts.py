@@ -15,9 +15,8 @@ from teamslam.sim.scenarios.scenario import dumps, load
 from teamslam.team.recording.check import check_log, holes
 from teamslam.team.recording.inventory import Inventory
 from teamslam.team.recording.merge import merge
-from teamslam.team.recording.own_log import own_log
 from teamslam.team.recording.part_files import part_of, parts_of
-from teamslam.team.recording.parts import check_continues, join_parts, next_part
+from teamslam.team.recording.parts import check_continues, join_parts, next_part, own_log
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.records import read_frames

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from teamslam.team.recording.own_log import own_log
+from teamslam.team.recording.parts import own_log
 from teamslam.team.robot.main import RobotShell
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

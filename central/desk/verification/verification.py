@@ -29,7 +29,7 @@ from teamslam.central.desk.verification.recorded import (
     index_log,
 )
 from teamslam.central.desk.verification.robot import recompute_robot
-from teamslam.team.recording.own_log import OWN
+from teamslam.team.recording.parts import OWN
 from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.reader import Log
 from teamslam.team.wire import arrays

@@ -114,7 +114,7 @@ class ForeignKeys:
     def publish(
         self, key: str, payload: bytes, attachment: bytes | None = None, *, latched: bool = False
     ) -> None:
-        """Publish, dropped by a slow network; late subscribers receive a latched message."""
+        """Publish, unless the network is slow; late subscribers receive a latched message."""
         publisher = self._publishers.get(key)
         if publisher is None:
             drop = zenoh.CongestionControl.DROP
