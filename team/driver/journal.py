@@ -219,8 +219,7 @@ class Journal:
                     self.team, self.start = said["team"], tuple(said["start"])
                 self.state, self.delivered = said["state"], said["delivered"]
                 self.clock = said.get("clock", {})
-                if self.incarnation:
-                    self._numbered[self.incarnation].extend(self._sorter.flush())
+                self._number_all()
                 if said["latency_ns"] is not None:
                     self._sorter.latency_ns = said["latency_ns"]
                 if said["incarnation"] is not None and not self.incarnation:
@@ -233,8 +232,7 @@ class Journal:
             if kind == ODOMETRY and stamp_ns != self.driven_ns:
                 self.driven_ns, self.pose = stamp_ns, None
             if kind == START:
-                if self.incarnation:
-                    self._numbered[self.incarnation].extend(self._sorter.flush())
+                self._number_all()
                 self.incarnation = self.next_incarnation
                 self._sorter = Sorter(self._sorter.latency_ns)
                 self._sorter.released = (stamp_ns, START)
@@ -243,6 +241,10 @@ class Journal:
                 return
             self._numbered[self.incarnation].extend(self._sorter.put((stamp_ns, kind), at))
             self.newest_ns = max(self.newest_ns, stamp_ns)
+
+    def _number_all(self) -> None:
+        if self.incarnation:
+            self._numbered[self.incarnation].extend(self._sorter.flush())
 
     @property
     def next_incarnation(self) -> int:
@@ -302,7 +304,7 @@ def open_journal(
     try:
         if not _read_whole(journal):
             left = f"{path}: {journal.cut} bytes of a beginning are left out" * bool(journal.cut)
-            journal.first_incarnation = _first_after(_newest_aside(path), robot)
+            journal.first_incarnation = _first_after(_aside(path)[0], robot)
             return _begin_file(journal, latency_ns, team, start), left, ""
         is_old = age_s >= OLD_S and not was_set_since(journal.clock)
         why = _why_not_continued(journal, team, start, age_s if is_old else 0.0)
@@ -355,7 +357,8 @@ def replace_journal(
     Returns it with a description. why: the reason, after "its stream".
     """
     journal.close()
-    aside = _set_aside(journal.path)
+    _, aside = _aside(journal.path)
+    journal.path.rename(aside)
     fresh = _lock_file(journal.path, journal.robot)
     fresh.first_incarnation = journal.next_incarnation
     said = f"{journal.path}: its stream {why}: it is now {aside}, and a new one begins"
@@ -431,31 +434,17 @@ def _head_of(journal: Journal) -> tuple[int, int] | None:
     there = begin.rstrip(b"\0")
     is_begun = beginning.startswith(there[: len(beginning)])
     is_short = len(there) < len(beginning) + _LONGEST
-    if is_begun and is_short and _is_blank(journal._file, len(begin)):
-        journal.cut = os.fstat(journal._file).st_size
+    size = os.fstat(journal._file).st_size
+    if is_begun and is_short and not any(os.pread(journal._file, size, len(begin))):
+        journal.cut = size
         return None
     whose = f"of {head['robot']}" if "robot" in head else "no driver's"
     raise JournalError(f"{journal.path}: a file {whose}, not of {journal.robot}: give another file")
 
 
-def _is_blank(file: int, at: int) -> bool:
-    while block := os.pread(file, 2**20, at):
-        if any(block):
-            return False
-        at += len(block)
-    return True
-
-
-def _newest_aside(path: Path) -> Path | None:
-    number = 1
-    while path.with_name(f"{path.name}.{number}").exists():
-        number += 1
-    return path.with_name(f"{path.name}.{number - 1}") if number > 1 else None
-
-
-def _set_aside(path: Path) -> Path:
-    number = 1
+def _aside(path: Path) -> tuple[Path | None, Path]:
+    """Return the newest file that was set aside, and the name of the next one."""
+    newest, number = None, 1
     while (aside := path.with_name(f"{path.name}.{number}")).exists():
-        number += 1
-    path.rename(aside)
-    return aside
+        newest, number = aside, number + 1
+    return newest, aside

@@ -132,12 +132,14 @@ class SourceNode:
 
     @property
     def _has_credit(self) -> bool:
-        consumed = self.delivered[1] if self.delivered[0] == self._incarnation else 0
-        is_there = ch.robot_node(self._robot) in self.alive
-        if is_there and self._published - consumed >= CREDIT_MEASUREMENTS:
-            return False
-        recorded = self.recorded[1] if self.recorded[0] == self._incarnation else 0
-        return "recorder" not in self.alive or self._published - recorded < CREDIT_RECORDER
+        return all(
+            node not in self.alive
+            or self._published - (consumed[1] if consumed[0] == self._incarnation else 0) < credit
+            for node, consumed, credit in (
+                (ch.robot_node(self._robot), self.delivered, CREDIT_MEASUREMENTS),
+                ("recorder", self.recorded, CREDIT_RECORDER),
+            )
+        )
 
     def head(self, *, again: bool = False) -> list[Outgoing]:
         """Publish the stream's head if it has changed; again: in any case."""

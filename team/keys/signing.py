@@ -58,14 +58,14 @@ class Signer:
 
     def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
         """Verify a signature of this name against a certificate."""
-        key = _public_key(certificate)
-        if key is None:
-            return False
         try:
-            key.verify(signature, self._team.encode() + b"\0" + named, _ALGORITHM)
+            key = _public_key(certificate)
+            if isinstance(key, ec.EllipticCurvePublicKey):
+                key.verify(signature, self._team.encode() + b"\0" + named, _ALGORITHM)
+                return True
         except (InvalidSignature, ValueError):
-            return False
-        return True
+            pass
+        return False
 
 
 @lru_cache(maxsize=1024)
@@ -88,9 +88,5 @@ def _issued(authority: x509.Certificate, team: str, node: str, certificate: byte
 
 
 @lru_cache(maxsize=1024)
-def _public_key(certificate: bytes) -> ec.EllipticCurvePublicKey | None:
-    try:
-        key = x509.load_der_x509_certificate(certificate).public_key()
-    except ValueError:
-        return None
-    return key if isinstance(key, ec.EllipticCurvePublicKey) else None
+def _public_key(certificate: bytes) -> object:
+    return x509.load_der_x509_certificate(certificate).public_key()

@@ -37,7 +37,12 @@ def check_log(log: Log) -> list[Finding]:
     """Find all defects of file, schemas, counters and messages, in 16 bytes a message and one
     chunk.
     """
-    found = _of_file(log)
+    found = [] if log.complete else [Finding(FILE, UNFINISHED)]
+    for each in log.files:
+        if each.complete:
+            with each.path.open("rb") as file:
+                damage = check_index(file)
+            found += [] if damage is None else [Finding(FILE, damage)]
     evidence = _evidence(log)
     unsound: dict[str, tuple[int, str]] = {}
     damaged: list[str] = []
@@ -162,16 +167,6 @@ NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
 NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
-
-
-def _of_file(log: Log) -> list[Finding]:
-    found = [] if log.complete else [Finding(FILE, UNFINISHED)]
-    for each in log.files:
-        if each.complete:
-            with each.path.open("rb") as file:
-                damage = check_index(file)
-            found += [] if damage is None else [Finding(FILE, damage)]
-    return found
 
 
 def _stamps() -> "array[int]":

@@ -61,13 +61,10 @@ def _within(
     for sample in log.samples(channels):
         if end_ns is not None and sample.stamp_ns >= end_ns:
             continue
-        if begin_ns is None or sample.stamp_ns >= begin_ns or _stands(sample.key):
+        row = ch.row_of(sample.key)
+        stands = row is not None and row.name in STANDING
+        if begin_ns is None or sample.stamp_ns >= begin_ns or stands:
             yield sample
-
-
-def _stands(key: str) -> bool:
-    found = ch.channel_of(key)
-    return found is not None and found[0].name in STANDING
 
 
 def _note(

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import msgpack
 import zstandard
@@ -118,7 +118,9 @@ class Log:
             channels = Channels(names)
             # The index repeats the channels, since a chunk that introduced one may be damaged.
             if part.complete:
-                self._read_index(file, part.path, channels)
+                with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels
+                    for frame in read_index(file, part.path):
+                        self._introduce(frame.opcode, frame.body, channels)
             for frame in read_frames(file, part.path):
                 if frame.opcode == Opcode.CHUNK:
                     self.reading((before + frame.offset) / whole)
@@ -131,11 +133,6 @@ class Log:
                     return
         if part.complete:
             raise LogError(part.path, "ends before its own index", REPAIR)
-
-    def _read_index(self, file: IO[bytes], path: Path, channels: Channels) -> None:
-        with suppress(LogError, *MALFORMED):  # whole chunks introduce their channels
-            for frame in read_index(file, path):
-                self._introduce(frame.opcode, frame.body, channels)
 
     def _introduce(self, opcode: int, body: bytes, channels: Channels) -> None:
         if opcode == Opcode.SCHEMA:

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 
 import msgspec
 
@@ -14,7 +14,7 @@ from teamslam.team.recording.part_files import LOG_ID
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
+from teamslam.team.wire.bus import Bus, Outgoing, Sample, open_valid
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.intervals import describe_intervals
 from teamslam.team.wire.request_times import RequestTimes
@@ -124,10 +124,12 @@ class RecordLoop:
         ]
         self._dropped += len(samples) - len(noted)
         self._write([own for sample, own in noted if self._inventory.is_new(sample)])
-        leaving = [tally for each, _ in noted if (tally := self._note_tally(each)) is not None]
+        leaving = [each for each, _ in noted if ch.TALLY.owner(each.key) is not None]
+        tallies = [message for _, _, message in open_valid(leaving) if isinstance(message, m.Tally)]
+        self._leaving |= {tally.node: tally for tally in tallies}
         if self._is_far_behind:
             return
-        for tally in leaving:
+        for tally in tallies:
             self._report_lacking(tally)
         every = PROGRESS_EVERY if samples else 1
         for (robot, incarnation), (measurements, submaps) in self._inventory.counts().items():
@@ -148,16 +150,6 @@ class RecordLoop:
     def _is_far_behind(self) -> bool:
         return self._recorder is not None and self._recorder.waiting() > _FAR_BEHIND
 
-    def _note_tally(self, sample: Sample) -> m.Tally | None:
-        if ch.TALLY.owner(sample.key) is None:
-            return None
-        with suppress(WireError):
-            message = opened(sample)[2]
-            if isinstance(message, m.Tally):
-                self._leaving[message.node] = message
-                return message
-        return None
-
     def _report_lacking(self, tally: m.Tally) -> None:
         found = self._inventory.received.lacking(tally, self._bus.find_awaited())
         has = msgspec.structs.replace(tally, keys=tuple(found), counts=tuple(found.values()))
@@ -171,14 +163,11 @@ class RecordLoop:
         except RecorderError as error:
             if self._more is None:
                 raise
-            self._note_failure(error)
+            _LOG.error("nothing is recorded any more: %s; trying again every %g s", error, _RETRY_S)
+            self._recorder, self._failure = None, error
+            self._retry_s = time.monotonic() + _RETRY_S
         else:
             self._messages += len(samples)
-
-    def _note_failure(self, error: RecorderError) -> None:
-        _LOG.error("nothing is recorded any more: %s; trying again every %g s", error, _RETRY_S)
-        self._recorder, self._failure = None, error
-        self._retry_s = time.monotonic() + _RETRY_S
 
     def _open_next_part(self, now_s: float) -> None:
         if self._recorder is not None or self._more is None or now_s < self._retry_s:

@@ -76,11 +76,6 @@ def numbers_of(name: str, value: bytes) -> NDArray[Any]:
     return _ARRAYS.get(name, floats)(value, name)
 
 
-def type_of_numbers(name: str) -> str:
-    """Return the NumPy type of a field's numbers."""
-    return str(numbers_of(name, b"").dtype)
-
-
 class CsvTable:
     """One channel's CSV file."""
 
@@ -181,7 +176,7 @@ def export_tables(
 def _arrow_type(pa: Any, name: str, kind: object) -> Any:
     of = getattr(kind, "__origin__", kind)
     if of is bytes and kind != Digest:
-        return pa.list_(pa.from_numpy_dtype(type_of_numbers(name)))
+        return pa.list_(pa.from_numpy_dtype(numbers_of(name, b"").dtype))
     scalars = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
     return scalars.get(of, pa.string()) if isinstance(of, type) else pa.string()
 

@@ -197,7 +197,12 @@ def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sam
     Raises `WireError` if the message does not answer this query, or belongs to another robot.
     """
     if channel is ch.KEPT:
-        return _read_stored(payload)
+        kept = decoded(payload, m.Kept)
+        stored = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
+        if opened(stored)[0] not in ch.REPLIES[ch.KEPT]:
+            text = f"the router stores nothing on the key {kept.key[:80]!r}"
+            raise WireError("wrong field", text)
+        return stored
     message: m.Message = decoded(payload)
     of = next((c for c in ch.REPLIES[channel] if isinstance(message, c.kinds)), None)
     robot = getattr(message, "robot", getattr(message, "node", ""))
@@ -206,14 +211,6 @@ def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sam
         text = f"{type(message).__name__} of {robot!r} is no reply to {channel.key(name)!r}"
         raise WireError("wrong field", text)
     return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, NO_COUNTER)
-
-
-def _read_stored(payload: bytes) -> Sample:
-    kept = decoded(payload, m.Kept)
-    sample = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
-    if opened(sample)[0] not in ch.REPLIES[ch.KEPT]:
-        raise WireError("wrong field", f"the router stores nothing on the key {kept.key[:80]!r}")
-    return sample
 
 
 NO_COUNTER = 2**32 - 1

@@ -250,10 +250,6 @@ class ZenohBus:
             self.dropped += 1
         LOG.warning("%s: dropped, %s (%d so far)", cut(key, 80), why, self.dropped)
 
-    def _can_do_without(self, key: str) -> bool:
-        row = row_of(key) if self._sheds else None
-        return row is not None and row.name in self._sheds
-
     def _shed(self, item: _Item) -> None:
         if self._queue.qsize() < MOST_WAITING:
             self._admit(item)
@@ -313,7 +309,9 @@ class ZenohBus:
             return
         key = whole.removeprefix(self._prefix)
         sample = Sample(key, item.payload.to_bytes(), *beside)
-        if item.source_info is None or self._can_do_without(key):  # lost samples are not requested
+        row = row_of(key)
+        is_shed = row is not None and row.name in self._sheds
+        if item.source_info is None or is_shed:  # lost samples are not requested
             samples.append(sample)
         else:
             samples += self._recovery.take_sample(sample, item.source_info)

@@ -62,19 +62,16 @@ def subscribe(
     if channel.delivery == "stream":
         session.declare_subscriber(key, callback, allowed_origin=remote)
         return
+    has_all = whole or channel.delivery == "all"
     ext.declare_advanced_subscriber(
         session,
         key,
         callback,
         allowed_origin=remote,
-        history=_history(channel, whole=whole),
+        # No detection of late publishers for one sample: after a cut the publisher counts as late,
+        # and a query for one sample would replace the recovery of all.
+        history=ext.HistoryConfig(
+            max_samples=WHOLE_CACHE if has_all else 1, detect_late_publishers=has_all
+        ),
         recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
     )
-
-
-def _history(channel: Channel, *, whole: bool) -> ext.HistoryConfig:
-    # No detection of late publishers for one sample: after a cut the publisher counts as late, and
-    # a query for one sample would replace the recovery of all.
-    if channel.delivery == "latest" and not whole:
-        return ext.HistoryConfig(max_samples=1, detect_late_publishers=False)
-    return ext.HistoryConfig(max_samples=WHOLE_CACHE, detect_late_publishers=True)

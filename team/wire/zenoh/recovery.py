@@ -36,6 +36,8 @@ LONGEST_KEY = 512
 MOST_ASKED = 256
 """Most cache requests in one check."""
 
+_UNTRACKED = "%.80s: too many publishers there, what is missing is not requested (%d so far)"
+
 
 @dataclass(frozen=True)
 class Heartbeat:
@@ -148,18 +150,14 @@ class Recovery:
                 return None
             node = _node_of(key)
             if self._tracked[node] >= MOST_OF_A_NODE or len(self._arrivals) >= MOST_PUBLISHERS:
-                self._note_untracked(key)
+                self.untracked += 1
+                LOG.warning(_UNTRACKED, key, self.untracked)
                 return None
             whole = row.delivery == "all" or row.name in self._whole
             found = Arrivals(0 if whole else first_known, in_order=whole)
             self._arrivals[key, publisher] = found
             self._tracked[node] += 1
         return found
-
-    def _note_untracked(self, key: str) -> None:
-        self.untracked += 1
-        text = "%.80s: too many publishers there, what is missing is not requested (%d so far)"
-        LOG.warning(text, key, self.untracked)
 
     def overdue(self, now_s: float) -> list[Sample]:
         """Request missing samples; return those that are no longer delayed by a gap."""
