@@ -15,8 +15,7 @@ GONE = {
     "outlier_share": "windows reject outliers without it: leave it out",
 }
 """Removed settings of `central` and `front_end` in old scenario files, with the remedy."""
-SHARES = ("garbage", "outlier_share")
-"""Fields of a robot's `front_end` that have no successor."""
+SHARES = ("garbage", "outlier_share")  # fields of a robot's `front_end` that have no successor
 VALUES = {("outlier_kind", "reading"): "measurement"}
 """Renamed values, by today's name of their field."""
 

@@ -13,10 +13,8 @@ import numpy as np
 from teamslam.team.datum import Datum
 from teamslam.team.shapes import Float
 
-A_M = 6_378_137.0
-"""Semi-major axis a of WGS84 [m]."""
-E2 = 0.00669437999014131699613723
-"""Squared eccentricity e² of WGS84."""
+A_M = 6_378_137.0  # semi-major axis a of WGS84 [m]
+E2 = 0.00669437999014131699613723  # squared eccentricity e² of WGS84
 ROUNDS = 20
 CONVERGED_M = 1e-6
 

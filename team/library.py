@@ -75,11 +75,9 @@ __all__ = [
     "word_likelihoods",
 ]
 
-_INCARNATION = 1
-"""Incarnation of every stream here."""
+_INCARNATION = 1  # incarnation of every stream here
 MOST_WORDS = 64
-UNEXPLAINED = 1e-4
-"""Share of descriptors that no word explains."""
+UNEXPLAINED = 1e-4  # share of descriptors that no word explains
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,7 @@
 
 from enum import StrEnum
 
-REJECTED = "rejected: "
-"""Begins the disposition of a rejected measurement."""
+REJECTED = "rejected: "  # begins the disposition of a rejected measurement
 
 
 class Rejection(StrEnum):
@@ -12,8 +11,7 @@ class Rejection(StrEnum):
     OLDER = "older than the odometry"
     NOT_COVERED = "no odometry covers it"
     NO_TIME = "odometry over no time"
-    SPEED = "odometry beyond the bounds"
-    """The interval's time is used, its motion is not."""
+    SPEED = "odometry beyond the bounds"  # the interval's time is used, its motion is not
     STEERING = "steering without a car's motion model"
     """As SPEED; steering needs motion.kind = "ackermann"."""
     TIME = "a time beyond the bounds"
@@ -29,8 +27,7 @@ class Rejection(StrEnum):
     NO_NODES = "sightings and fixes need pose nodes, and front_end.node_s is 0"
     NO_NODE = "no pose node near it"
     LATE = "counted in a window that ends before its stamp"
-    UNSOLVED = "its window has no solution"
-    """The submap has the odometry's motion alone."""
+    UNSOLVED = "its window has no solution"  # the submap has the odometry's motion alone
     SET_ASIDE = "its handling raised"
 
     @property

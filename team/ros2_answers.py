@@ -26,12 +26,10 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, landmark_blocks, stamps
 from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys
 
-MOST_PATH = 2000
-"""Most poses of a path; a longer one keeps every second pose."""
+MOST_PATH = 2000  # most poses of a path; a longer one keeps every second pose
 PATH_GROWTH, PATH_S = 1.02, 1.0
 """A path is published again once it has grown by this factor, at most every PATH_S of team time."""
-MOST_WAITING = 1000
-"""Most messages that wait for `LiveAnswers.publish`."""
+MOST_WAITING = 1000  # most messages that wait for `LiveAnswers.publish`
 TRANSFORM_S = 0.1
 """Period [s] at which the newest map → odom is repeated with the odometry's newest stamp."""
 HELD_S = 30.0
@@ -191,8 +189,7 @@ class RosPublisher:
         self._domain = domain
         self._keys: dict[str, tuple[str, str, bytes]] = {}
         self._number = 0
-        self.published = 0
-        """Number of published messages."""
+        self.published = 0  # number of published messages
 
     def publish(self, answer: Answer) -> None:
         """Publish one message; the topic is announced with its first one."""

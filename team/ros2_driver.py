@@ -41,16 +41,11 @@ from teamslam.team.wire.zenoh.foreign_keys import ForeignSample
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 FIX = "sensor_msgs/msg/NavSatFix"
-HELD = 1000
-"""Most waiting messages of a topic of unknown type."""
-MOST_REASONS = 100
-"""Most reasons for dropping that are told apart: a key's type may be any text."""
-WARN_S = 10.0
-"""Interval [s] between two reports of dropped messages."""
-SILENT_S = 10.0
-"""Time [s] after which missing odometry is reported."""
-BEHIND_S = 1.0
-"""Waiting time [s] of a message from which the driver is slower than its topics."""
+HELD = 1000  # most waiting messages of a topic of unknown type
+MOST_REASONS = 100  # most reasons for dropping that are told apart: a key's type may be any text
+WARN_S = 10.0  # interval [s] between two reports of dropped messages
+SILENT_S = 10.0  # time [s] after which missing odometry is reported
+BEHIND_S = 1.0  # waiting time [s] of a message from which the driver is slower than its topics
 NANO = Decimal(10) ** -9
 _LOG = logging.getLogger("teamslam")
 _MOUNT = (

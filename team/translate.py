@@ -296,8 +296,7 @@ def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray,
 
 
 LandmarkMap = TypeVar("LandmarkMap", m.MapEstimate, m.FusedMap)
-NAMED = 10
-"""Number of omitted landmarks that are named."""
+NAMED = 10  # number of omitted landmarks that are named
 
 
 def make_receivable(message: LandmarkMap) -> tuple[LandmarkMap, tuple[str, ...]]:

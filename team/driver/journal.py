@@ -78,12 +78,10 @@ odometry would be refused; not if the wall clock was set meanwhile.
 _HEAD = struct.Struct("<IBq")
 _CHECK = struct.Struct("<I")
 _POSE = struct.Struct("<3d")
-_LONGEST = 9
-"""Length of the longest number in a head [bytes]."""
+_LONGEST = 9  # length of the longest number in a head [bytes]
 
 
-Start = tuple[bytes, bytes]
-"""Pose and covariance of an `InitialPose`; empty: unknown."""
+Start = tuple[bytes, bytes]  # pose and covariance of an `InitialPose`; empty: unknown
 
 
 class JournalError(RuntimeError):

@@ -21,20 +21,15 @@ from teamslam.team.wire.zenoh.bus import ZenohBus
 
 HEAD_S = 1.0
 PACE_S = 0.01
-ATTEMPT_S = 0.3
-"""Duration [s] of an attempt to reach a router that is not there."""
-AGAIN_S = 2.0
-"""Wait [s] before another attempt to reach the router."""
+ATTEMPT_S = 0.3  # duration [s] of an attempt to reach a router that is not there
+AGAIN_S = 2.0  # wait [s] before another attempt to reach the router
 SECOND_PATIENCE_S = 6.0
 """Wait [s] for another driver's token: that of a cut-off driver lasts for its lease of 5 s."""
-HEAR_S = 0.5
-"""Time [s] within which a present robot's process reports its progress."""
+HEAR_S = 0.5  # time [s] within which a present robot's process reports its progress
 HEAR_RUN_S = 3.0
 """Longest time [s] until a present recorder's status names the run, for a stream of some run."""
-FIRST_S = 10.0
-"""Longest time [s] for a first attempt that reaches the router."""
-LAST_S = 5.0
-"""Longest time [s] for the remaining publications at the end."""
+FIRST_S = 10.0  # longest time [s] for a first attempt that reaches the router
+LAST_S = 5.0  # longest time [s] for the remaining publications at the end
 _LOG = logging.getLogger("teamslam")
 
 
@@ -59,8 +54,7 @@ class Link:
         self._up = threading.Event()
         self._tried = threading.Event()
         self._is_open = False
-        self.left = ""
-        """Description of a stream that is set aside; empty: none."""
+        self.left = ""  # description of a stream that is set aside; empty: none
         self._moved = threading.Condition()
         self._trouble: Exception | None = None
         self._failure: Exception | None = None

@@ -16,10 +16,8 @@ from teamslam.team.wire.codec import find_error
 M = TypeVar("M", bound=m.Measurement)
 NAME = "[a-z][a-z0-9_]{0,31}"
 NAMED = "a small letter, then small letters, digits and _ (32 at most)"
-UNNAMED = 2**31
-"""Ids from here on are reserved for landmarks without identity."""
-LARGEST_SIGMA_RAD = 0.5
-"""A larger standard deviation of a bearing [rad] is probably in degrees."""
+UNNAMED = 2**31  # ids from here on are reserved for landmarks without identity
+LARGEST_SIGMA_RAD = 0.5  # a larger standard deviation of a bearing [rad] is probably in degrees
 
 
 class MeasurementError(ValueError):

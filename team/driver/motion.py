@@ -10,8 +10,7 @@ from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USU
 
 TOLERANCE = 0.1
 """Clock jitter: largest share of an interval between its start and the end of the last one."""
-LEAST_NS = 2_000_000
-"""Clock jitter that is always accepted."""
+LEAST_NS = 2_000_000  # clock jitter that is always accepted
 UNMEASURED = (1.0, 0.5)
 """Least standard deviation [m/s, rad/s] of a bridged motion; otherwise that of its speed."""
 Pose = tuple[float, float, float]

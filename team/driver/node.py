@@ -23,8 +23,7 @@ from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded
 
 DAY_NS = 86_400 * 10**9
-Stream = tuple[int, int]
-"""(incarnation, measurements) that a receiver has consumed."""
+Stream = tuple[int, int]  # (incarnation, measurements) that a receiver has consumed
 
 
 @dataclass
@@ -52,10 +51,8 @@ class SourceNode:
 
     def __post_init__(self) -> None:
         self._robot = self.journal.robot
-        self.alive: set[str] = set()
-        """The nodes of the team that are present."""
-        self.run = ""
-        """The team's run by its recorder; empty: none is known."""
+        self.alive: set[str] = set()  # the nodes of the team that are present
+        self.run = ""  # the team's run by its recorder; empty: none is known
         self._read_journal()
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
@@ -63,10 +60,8 @@ class SourceNode:
         """Figures and warnings of the driver's input, such as a ROS 2 robot's topics."""
         self.on_message: Callable[[m.Message], None] | None = None
         """Called in the link's thread with each message of the team, for a program's own use."""
-        self.maps: tuple[m.SavedMap, ...] = ()
-        """Saved maps of earlier days, for the team's set."""
-        self.listening = True
-        """True until the robot's earlier progress has been received."""
+        self.maps: tuple[m.SavedMap, ...] = ()  # saved maps of earlier days, for the team's set
+        self.listening = True  # true until the robot's earlier progress has been received
 
     def replace(self, journal: Journal) -> None:
         """Publish another journal from its beginning."""

@@ -10,10 +10,8 @@ CREDIT_MEASUREMENTS = 4096
 """Most measurements that a source is ahead of its robot, while that is present."""
 CREDIT_RECORDER = 16384
 """Most measurements, over all robots, that a source is ahead of a present recorder."""
-BATCH = 256
-"""Measurements published between two checks of the inbox."""
-ANSWER = 8192
-"""Most measurements in one answer to a query."""
+BATCH = 256  # measurements published between two checks of the inbox
+ANSWER = 8192  # most measurements in one answer to a query
 FIRST_INCARNATION = 1
 
 

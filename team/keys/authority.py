@@ -30,8 +30,7 @@ from teamslam.team.keys.roster import (
 CA_KEY = "ca.key"
 AUTHORITY_DAYS = 3650
 SKEW = timedelta(hours=1)
-LOCAL = ("localhost", "127.0.0.1", "::1")
-"""Hosts valid in every router certificate."""
+LOCAL = ("localhost", "127.0.0.1", "::1")  # hosts valid in every router certificate
 
 
 @dataclass(frozen=True)

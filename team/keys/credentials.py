@@ -14,8 +14,7 @@ from cryptography.x509.oid import NameOID
 from teamslam.team.keys.roster import KeysError
 
 CA = "ca.pem"
-SOON = timedelta(days=7)
-"""Remaining validity that causes a warning."""
+SOON = timedelta(days=7)  # remaining validity that causes a warning
 _REMEDY = "make new ones by `teamslam keys` and copy them"
 
 

@@ -13,8 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 ROSTER = "roster.json"
-STANDING = ("central", "operator", "recorder", "router", "viewer", "world")
-"""Nodes of every team."""
+STANDING = ("central", "operator", "recorder", "router", "viewer", "world")  # nodes of every team
 REPLAY = "replay"
 TEAM = re.compile("[A-Za-z0-9._-]{1,64}")
 ROBOT = re.compile("[a-z][a-z0-9_]{0,31}")

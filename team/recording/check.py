@@ -19,8 +19,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open
 from teamslam.team.wire.codec import WireError
 
-FILE = "file"
-"""Place of a finding without a key."""
+FILE = "file"  # place of a finding without a key
 
 
 class Finding(NamedTuple):
@@ -159,8 +158,7 @@ class _Evidence:
 
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
-_OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}
-"""Channels published after the end of the streams."""
+_OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}  # channels published after the end of the streams
 _READ = {ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ROBOT_DONE, *_FINAL, ch.TALLY, ch.STATUS}
 """Channels whose presence or content is evidence beyond their counters."""
 NO_END = "missing: the number of measurements is unknown"

@@ -12,10 +12,8 @@ from teamslam.team.shapes import Int64
 from teamslam.team.wire.bus import NO_COUNTER, Sample
 from teamslam.team.wire.intervals import Interval, IntervalSet, describe_intervals
 
-Life = Int64[np.ndarray, "_"]
-"""Positions of one life's publications, by counter."""
-LATEST_NS = 2**63 - 1
-"""Largest wall clock [ns]; later ones are from damaged or hostile logs."""
+Life = Int64[np.ndarray, "_"]  # positions of one life's publications, by counter
+LATEST_NS = 2**63 - 1  # largest wall clock [ns]; later ones are from damaged or hostile logs
 
 
 class Counters:

@@ -9,8 +9,7 @@ from teamslam.team.recording.summary import summarise_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Sample
 
-CUT = "cut"
-"""Metadata name that marks a cut, with the original log."""
+CUT = "cut"  # metadata name that marks a cut, with the original log
 STANDING = frozenset(
     channel.name
     for channel in (ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.WORLD_CONFIG, ch.TRUTH_LANDMARKS)

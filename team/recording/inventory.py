@@ -80,8 +80,7 @@ def _is_acknowledged(channel: ch.Channel) -> bool:
     return channel.recorded and channel.delivery != "stream" and channel not in NUMBERED
 
 
-MISSING = "missing: "
-"""Prefix of the recorder's last note, which lists missing messages."""
+MISSING = "missing: "  # prefix of the recorder's last note, which lists missing messages
 Kind = Literal["measurements", "submaps"]
 _ASKED_FOR = (ch.SIGHTING_FACTOR, *ch.REPLIES[ch.KEPT])
 """Channels without numbers, sent as replies; repetitions are recognised by their content."""

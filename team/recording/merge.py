@@ -11,8 +11,7 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import SENSORS, SIGHTING_FACTOR, SUBMAP, channel_of
 
 _BY_CONTENT = (*SENSORS, SUBMAP, SIGHTING_FACTOR)
-MERGED = "merged"
-"""Metadata name that lists the merged logs."""
+MERGED = "merged"  # metadata name that lists the merged logs
 
 
 class Merged(NamedTuple):

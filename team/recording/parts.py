@@ -30,13 +30,10 @@ from teamslam.team.wall_clock import wall_clock, was_set_since
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import FINAL_MAP, Channel
 
-LONGEST_AWAY_S = 3600.0
-"""Age [s] beyond which a log belongs to another run."""
-ROOM = 16 * 2**20
-"""Bytes to keep free on the disk."""
+LONGEST_AWAY_S = 3600.0  # age [s] beyond which a log belongs to another run
+ROOM = 16 * 2**20  # bytes to keep free on the disk
 JOINING = ".joining"
-OWN = "own_log"
-"""Metadata name that marks a single process's log."""
+OWN = "own_log"  # metadata name that marks a single process's log
 _LOG = logging.getLogger("teamslam")
 
 

@@ -22,14 +22,10 @@ from teamslam.team.wire.codec import tag_in
 from teamslam.team.wire.messages import tag_of
 
 METADATA = "teamslam"
-CHUNK_NS = 500_000_000
-"""Largest span of wall time in a chunk, since a flipped bit costs a chunk …"""
-CHUNK_LEAST = 16
-"""… unless the chunk has fewer messages than this."""
-MOST_CHANNELS = 60_000
-"""Most keys of a log; MCAP numbers them with 16 bits."""
-FLUSH_S = 0.5
-"""Seconds between flushes: the loss of a killed recorder."""
+CHUNK_NS = 500_000_000  # largest span of wall time in a chunk, since a flipped bit costs a chunk …
+CHUNK_LEAST = 16  # … unless the chunk has fewer messages than this
+MOST_CHANNELS = 60_000  # most keys of a log; MCAP numbers them with 16 bits
+FLUSH_S = 0.5  # seconds between flushes: the loss of a killed recorder
 
 
 class RecorderError(RuntimeError):
@@ -50,8 +46,7 @@ class Recorder:
         self._in_chunk = 0
         self._span = (2**63, 0)
         self._closed = False
-        self.dropped = 0
-        """Number of samples dropped beyond MOST_CHANNELS keys."""
+        self.dropped = 0  # number of samples dropped beyond MOST_CHANNELS keys
         try:
             self._file: IO[bytes] = self.path.open("xb")
             self._writer = _open_writer(self._file, self.metadata)

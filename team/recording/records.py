@@ -29,8 +29,7 @@ _AHEAD = 4096
 _OPCODES = frozenset((*range(Opcode.HEADER, Opcode.DATA_END + 1), *range(0x80, 0x100)))
 _LENGTHS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 """Record sizes at a file's end: a flipped bit can turn a chunk's opcode into one of them."""
-_COMPRESSION = b"\x04\0\0\0zstd"
-"""Bytes in the head of each chunk of our recorder …"""
+_COMPRESSION = b"\x04\0\0\0zstd"  # bytes in the head of each chunk of our recorder …
 _TO_COMPRESSION = _FRAME.size + 28
 """… and their offset: opcode, length, two times, size and checksum."""
 FRAME_SIZE = _FRAME.size

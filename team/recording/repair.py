@@ -14,8 +14,7 @@ from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire.bus import Sample
 
-REPAIRED = "repaired"
-"""Metadata name that marks a repaired log, with the original."""
+REPAIRED = "repaired"  # metadata name that marks a repaired log, with the original
 
 
 class Report(NamedTuple):

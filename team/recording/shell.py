@@ -36,12 +36,10 @@ def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, S
 
 
 NODE = "recorder"
-PROGRESS_EVERY = 256
-"""Measurements of a robot between progress reports under load."""
+PROGRESS_EVERY = 256  # measurements of a robot between progress reports under load
 _FAR_BEHIND = 20_000  # samples that the disk writes in half a second
 _WAIT_S = 0.05
-_PACE_S = 0.01
-"""Length of a receive turn; a turn per message costs a third more CPU."""
+_PACE_S = 0.01  # length of a receive turn; a turn per message costs a third more CPU
 _QUIET_S = 0.5
 _STATUS_S = 1.0
 _REMIND_S = 10.0

@@ -8,8 +8,7 @@ from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import SENSORS, row_of
 
-FOREIGN = "(no channel)"
-"""Channel of a key without a row in the table."""
+FOREIGN = "(no channel)"  # channel of a key without a row in the table
 
 
 @dataclass

@@ -106,8 +106,7 @@ def _text(value: object) -> str:
 
 
 GROUP_ROWS = 20_000
-GROUP_BYTES = 32 * 2**20
-"""Payload bytes per row group."""
+GROUP_BYTES = 32 * 2**20  # payload bytes per row group
 
 
 class ParquetTable:

@@ -10,8 +10,7 @@ from teamslam.team.recording.reader import Channels, Log, LogError, open_log
 from teamslam.team.recording.records import FRAME_SIZE, MALFORMED, read_frames
 from teamslam.team.wire.bus import Sample
 
-MOST = 20_000
-"""Approximate limit on samples per call."""
+MOST = 20_000  # approximate limit on samples per call
 
 
 @dataclass
@@ -63,5 +62,4 @@ class Tail:
         return True
 
 
-_HEAD = 65_536
-"""File size [bytes] from which an invalid file cannot become a log."""
+_HEAD = 65_536  # file size [bytes] from which an invalid file cannot become a log

@@ -14,11 +14,9 @@ from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-MOST_WAITING = 100_000
-"""Most waiting messages of a topic; then the oldest is dropped, and counted."""
+MOST_WAITING = 100_000  # most waiting messages of a topic; then the oldest is dropped, and counted
 MOST_PUBLISHERS = 256
-MOST_SKIPPED = 1_000_000
-"""A counter that jumps farther has begun anew, or is no counter."""
+MOST_SKIPPED = 1_000_000  # a counter that jumps farther has begun anew, or is no counter
 _NAMED = struct.Struct("<x15sqx16sqx10sx16s")
 _PLAIN = struct.Struct("<qqx16s")
 _NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")

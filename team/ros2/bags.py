@@ -21,8 +21,7 @@ from rosbags.typesys.store import Typestore
 from teamslam.team.ros2.definitions import types
 
 SUFFIXES = (".mcap", ".db3")
-VERSION: Final = 9
-"""Version of a new bag's metadata, that of ROS 2 Jazzy."""
+VERSION: Final = 9  # version of a new bag's metadata, that of ROS 2 Jazzy
 
 
 class BagError(ValueError):

@@ -11,8 +11,7 @@ from rosbags.typesys.store import Typestore
 from teamslam.team.ros2.definitions import types
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-"""x, y, z, w."""
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
 
 class DamagedError(ValueError):

@@ -25,8 +25,7 @@ _BLUE, _GREY, _WHITE = (
     dict(zip("rgba", colour, strict=True))
     for colour in ((0.12, 0.47, 0.71, 0.35), (0.5, 0.5, 0.5, 0.35), (1.0, 1.0, 1.0, 0.9))
 )
-Pose = tuple[float, float, float]
-"""(x [m], y [m], θ [rad])."""
+Pose = tuple[float, float, float]  # (x [m], y [m], θ [rad])
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ import numpy as np
 from teamslam.team.ros2.decoding import Quaternion, Transform, Vector
 from teamslam.team.shapes import Float
 
-DEEPEST = 32
-"""Most transforms between a sensor and its base."""
+DEEPEST = 32  # most transforms between a sensor and its base
 
 
 def rotation_matrix(q: Quaternion) -> Float[np.ndarray, "3 3"]:
@@ -34,12 +33,10 @@ def heading(q: Quaternion) -> float:
     return atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-Place = tuple[float, float, float]
-"""A pose (x, y, yaw) on the base."""
+Place = tuple[float, float, float]  # a pose (x, y, yaw) on the base
 
 
-SAME_PLACE = 1e-3
-"""Places that differ by less [m, rad] are the same."""
+SAME_PLACE = 1e-3  # places that differ by less [m, rad] are the same
 
 
 @dataclass(frozen=True)
@@ -78,8 +75,7 @@ class Mount:
         return float(c[0, 0]), float(c[0, 1]), float(c[1, 1])
 
 
-BODY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""A frame with x ahead and y left."""
+BODY = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # a frame with x ahead and y left
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
 """A camera's frame, with z ahead and x right."""
 

@@ -11,8 +11,7 @@ from typing import NamedTuple
 RMW_TYPE = re.compile(r"^(\w+)::(msg)::dds_::(\w+)_$")
 BRIDGE_TOKENS = "@/*/@ros2_lv/MP/**"
 SLASH = "§"
-ESCAPED = "%"
-"""Stands for / in the liveliness tokens of rmw_zenoh."""
+ESCAPED = "%"  # stands for / in the liveliness tokens of rmw_zenoh
 STATIC = "tf_static"
 MOVING = "tf"
 

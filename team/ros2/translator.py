@@ -30,8 +30,7 @@ NO_DATUM = (
     "a fix, since there is no datum: give [datum] with latitude_deg and longitude_deg in the file "
     "of topics, the same for all robots"
 )
-MOST_NAMED = 20
-"""Most undecided frames that are named."""
+MOST_NAMED = 20  # most undecided frames that are named
 
 
 class Pose(NamedTuple):

@@ -20,12 +20,9 @@ else:
 
     np = _NumPy()
 
-Floats = bytes
-"""float64, little-endian."""
-Ids = bytes
-"""uint32, little-endian."""
-Stamps = bytes
-"""int64 nanoseconds, little-endian."""
+Floats = bytes  # float64, little-endian
+Ids = bytes  # uint32, little-endian
+Stamps = bytes  # int64 nanoseconds, little-endian
 
 
 def _array(data: bytes, dtype: str, what: str) -> "np.typing.NDArray[Any]":

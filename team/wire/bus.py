@@ -213,8 +213,7 @@ def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sam
     return Sample(of.key(robot), payload, message.stamp_ns, wall_ns, NO_COUNTER)
 
 
-NO_COUNTER = 2**32 - 1
-"""The counter of a sample that was a reply."""
+NO_COUNTER = 2**32 - 1  # the counter of a sample that was a reply
 
 
 LATEST_CACHE = 8_192

@@ -6,8 +6,7 @@ import msgspec
 
 from teamslam.team.wire import messages as m
 
-NO_MAP = bytes(8)
-"""The digest of no map."""
+NO_MAP = bytes(8)  # the digest of no map
 
 
 class Digest:

@@ -3,8 +3,7 @@
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 
-Interval = tuple[int, int]
-"""First and last number, both included."""
+Interval = tuple[int, int]  # first and last number, both included
 
 
 class IntervalSet:
@@ -74,8 +73,7 @@ class IntervalSet:
         return found
 
 
-SHOWN = 3
-"""Intervals that are named; the others are counted."""
+SHOWN = 3  # intervals that are named; the others are counted
 
 
 def describe_intervals(intervals: Sequence[Interval]) -> str:

@@ -4,10 +4,8 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-PATIENCE_S = 0.5
-"""Delay [s] before the first request."""
-LONGEST_S = 8.0
-"""Longest interval [s] between two equal requests, which double."""
+PATIENCE_S = 0.5  # delay [s] before the first request
+LONGEST_S = 8.0  # longest interval [s] between two equal requests, which double
 K = TypeVar("K", bound=Hashable)
 
 

@@ -9,14 +9,10 @@ from typing import Generic, TypeVar
 
 from teamslam.team.wire.intervals import IntervalSet
 
-PATIENCE_S = 0.5
-"""Age [s] at which a gap is requested."""
-LONGEST_S = 8.0
-"""Longest interval [s] between two requests, which double."""
-DELAY_S = 2.0
-"""Longest delay [s] of publications after a gap."""
-MOST_GAPS = 4096
-"""Most gaps per publisher and key; then the oldest is given up."""
+PATIENCE_S = 0.5  # age [s] at which a gap is requested
+LONGEST_S = 8.0  # longest interval [s] between two requests, which double
+DELAY_S = 2.0  # longest delay [s] of publications after a gap
+MOST_GAPS = 4096  # most gaps per publisher and key; then the oldest is given up
 T = TypeVar("T")
 
 

@@ -40,8 +40,7 @@ _FLUSH = "router/flush"
 _FLUSH_S = 10.0  # a closing bus waits this long for a router that reads slowly or is stopped
 MOST_WAITING = 1_000
 """Queue length beyond which an observing node drops dispensable samples, of some 10 kB each."""
-MOST_KEYS = 16_384
-"""Most keys on which a bus receives samples; a team of 100 robots has 4,500."""
+MOST_KEYS = 16_384  # most keys on which a bus receives samples; a team of 100 robots has 4,500
 
 
 @dataclass(frozen=True)
@@ -107,8 +106,7 @@ class ZenohBus:
         self._published: dict[str, int] = {}
         self._newest_ns = 0
         self._since_ns = time.time_ns()
-        self.tap: Tap | None = None
-        """Receives all samples that this bus publishes and receives."""
+        self.tap: Tap | None = None  # receives all samples that this bus publishes and receives
         self.dropped = 0
         """Samples dropped for a key of no channel, an unsound attachment, or another publisher's
         key.

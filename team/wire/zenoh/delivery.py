@@ -17,8 +17,7 @@ from teamslam.team.wire.channels import Channel, row_of
 _HEARTBEAT_S = 0.25
 _BLOCK = zenoh.CongestionControl.BLOCK
 _RELIABLE = zenoh.Reliability.RELIABLE
-PRIORITY = zenoh.Priority.DATA
-"""One priority for all samples preserves the order across keys."""
+PRIORITY = zenoh.Priority.DATA  # one priority for all samples preserves the order across keys
 _REPLIES = ext.RepliesConfig(congestion_control=_BLOCK, priority=PRIORITY)
 Publisher = zenoh.Publisher | ext.AdvancedPublisher
 

@@ -11,16 +11,13 @@ from zenoh.handlers import FifoChannel
 
 from teamslam.team.wire.bus import BusError
 
-TOKENS_S = 5.0
-"""Timeout [s] for the list of tokens that are present."""
+TOKENS_S = 5.0  # timeout [s] for the list of tokens that are present
 CAPACITY = 65_536
 """Capacity [messages] of a subscription. A full channel blocks Zenoh's thread, and the router then
 drops messages.
 """
-AT_ONCE = 10_000
-"""Most messages per subscription and call of `receive`."""
-LOOK_S = 0.005
-"""Polling interval [s] while nothing has arrived."""
+AT_ONCE = 10_000  # most messages per subscription and call of `receive`
+LOOK_S = 0.005  # polling interval [s] while nothing has arrived
 
 
 class ForeignSample(NamedTuple):

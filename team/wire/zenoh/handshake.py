@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from teamslam.team.keys.credentials import Credentials
 
-TIMEOUT_S = 1.0
-"""Timeout [s] of each step of a handshake."""
+TIMEOUT_S = 1.0  # timeout [s] of each step of a handshake
 _ENDPOINT = re.compile(r"(?P<protocol>\w+)/(?P<host>\[[^]]+\]|[^:/?#]+):(?P<port>\d+)")
 _ALERTS = {
     "UNKNOWN_CA": "it is of another authority than the router's: copy ca.pem and both files of "

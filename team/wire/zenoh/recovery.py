@@ -19,22 +19,16 @@ from teamslam.team.wire.channels import row_of
 from teamslam.team.wire.logs import LOG
 from teamslam.team.wire.zenoh.arrivals import Arrivals
 
-ADVANCED = "/@adv/pub/"
-"""Part of the keys of advanced publishers' heartbeats."""
+ADVANCED = "/@adv/pub/"  # part of the keys of advanced publishers' heartbeats
 _BEAT = struct.Struct("<I")  # payload of a heartbeat: the number of the last publication
 _LOOK_S = 0.1  # interval of the checks for missing samples
 _ANSWER_S = 10.0
 _SEVERAL = ""  # replaces a publisher's key: its samples arrived on several
-MOST_OF_A_NODE = 4_096
-"""Most tracked publishers on the keys of one node, each on one key."""
-MOST_PUBLISHERS = 131_072
-"""Most tracked publishers in all: some 100 MB."""
-MOST_BEATS = 131_072
-"""Most stored heartbeats; then they are cleared."""
-LONGEST_KEY = 512
-"""Longest key [characters] on which missing samples are requested."""
-MOST_ASKED = 256
-"""Most cache requests in one check."""
+MOST_OF_A_NODE = 4_096  # most tracked publishers on the keys of one node, each on one key
+MOST_PUBLISHERS = 131_072  # most tracked publishers in all: some 100 MB
+MOST_BEATS = 131_072  # most stored heartbeats; then they are cleared
+LONGEST_KEY = 512  # longest key [characters] on which missing samples are requested
+MOST_ASKED = 256  # most cache requests in one check
 
 _UNTRACKED = "%.80s: too many publishers there, what is missing is not requested (%d so far)"
 
@@ -80,8 +74,7 @@ class Recovery:
         self._tracked: Counter[str] = Counter()
         self._keys: dict[str, str] = {}
         self._look_due = 0.0
-        self.untracked = 0
-        """Number of samples and heartbeats of publishers beyond the bounds."""
+        self.untracked = 0  # number of samples and heartbeats of publishers beyond the bounds
 
     def watch(self, key: str) -> None:
         """Subscribe to the heartbeats of a key (with the session's prefix)."""

@@ -33,18 +33,15 @@ DROP_US = 300_000
 Zenoh then drops further publications to it at once until it reads again: a stopped subscriber
 delays the others once.
 """
-DROP_LARGE_US = 1_000_000
-"""Additional time [µs] for a publication of more than one batch."""
+DROP_LARGE_US = 1_000_000  # additional time [µs] for a publication of more than one batch
 CLOSE_US = 2_000_000
 """Time [µs] that a reply or a query waits for a full queue before the link is closed.
 
 Its process reconnects. A publication dropped for its size is fetched by a query, so a message of S
 bytes needs a link of (S − 5 MB) in that time.
 """
-QUEUE_BATCHES = 16
-"""Batches of 64 kB per subscriber's queue, Zenoh's largest number."""
-RX_THREADS = 128
-"""Receiving threads; more than a team has links."""
+QUEUE_BATCHES = 16  # batches of 64 kB per subscriber's queue, Zenoh's largest number
+RX_THREADS = 128  # receiving threads; more than a team has links
 _CONGESTION = "transport/link/tx/queue/congestion_control"
 _DROPS = {
     "messages": ["put"],
@@ -52,8 +49,7 @@ _DROPS = {
     "overwrite": {"congestion_control": "drop"},
 }
 """Publishers block on their own full queue; publications leaving the router do not."""
-MOST_TEAMS = 1_000
-"""Number of teams for which a router without keys stores messages."""
+MOST_TEAMS = 1_000  # number of teams for which a router without keys stores messages
 
 
 @contextmanager

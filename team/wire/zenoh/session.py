@@ -17,16 +17,11 @@ if TYPE_CHECKING:  # not needed without keys
 
 _LEASE_MS = 5_000  # silence after which a link counts as cut; detects a stopped process
 _BLOCK_US = 10_000_000  # time that a full queue may block a publisher before its link is closed
-FIRST_LOOK_S = 3.0
-"""Time [s] without a connection after which a client examines the router."""
-LINK_S = 1.0
-"""Interval [s] between two checks of the link."""
-LONGEST_S = 30.0
-"""Longest interval [s] between two examinations of a failing link, which double."""
-REPEAT_S = 60.0
-"""Interval [s] at which a client without a router logs the reason again."""
-ANSWER_S = 5.0
-"""Timeout [s] of the query for our certificate's acceptance, and of an examination."""
+FIRST_LOOK_S = 3.0  # time [s] without a connection after which a client examines the router
+LINK_S = 1.0  # interval [s] between two checks of the link
+LONGEST_S = 30.0  # longest interval [s] between two examinations of a failing link, which double
+REPEAT_S = 60.0  # interval [s] at which a client without a router logs the reason again
+ANSWER_S = 5.0  # timeout [s] of the query for our certificate's acceptance, and of an examination
 DOOR = "router/door"
 """Key prefix on which a router with keys answers for a certificate's common name."""
 ACCEPTED, REVOKED = b"accepted", b"revoked"

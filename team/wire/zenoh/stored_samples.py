@@ -14,13 +14,10 @@ from teamslam.team.wire.channels import ENDS, FINAL_MAP, ORDERS
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.messages import FusedMap, Kept, KeptRequest
 
-MOST_ORDERS = 10_000
-"""Most stored orders to a team, signatures included."""
-MOST_ENDS = 400
-"""Most keys of stored ends: two per robot of the largest team, and others."""
+MOST_ORDERS = 10_000  # most stored orders to a team, signatures included
+MOST_ENDS = 400  # most keys of stored ends: two per robot of the largest team, and others
 
-MOST_NODES = 1_000
-"""Most nodes of a team whose end is tracked."""
+MOST_NODES = 1_000  # most nodes of a team whose end is tracked
 
 
 @dataclass(frozen=True)
