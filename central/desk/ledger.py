@@ -20,9 +20,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
 
-IN_SUBMAP = "in a submap"
-OPEN = "open"
-LOST = "lost"
+IN_SUBMAP, OPEN, LOST = "in a submap", "open", "lost"
 MOST_LOST, MOST_LOST_SHARE = 1_000_000, 10
 """Limits on listed missing measurements: a number, or a multiple of the existing ones."""
 SubmapName = tuple[str, int, int]
@@ -67,10 +65,9 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Ledger:
-    """Entries by stream and counter, maps by submap, and violations.
+    """Entries by stream and counter, map digests by submap in log order, and violations.
 
-    maps: digests in log order. withdrawn: robots that the last map leaves out. rejected: by stream
-    and number.
+    withdrawn: robots that the last map leaves out. rejected: by stream and number.
     """
 
     entries: Mapping[Stream, tuple[Entry, ...]]
@@ -87,13 +84,8 @@ class Ledger:
 
     def totals(self, robot: str | None = None) -> dict[str, int]:
         """Measurements by disposition, of one robot or all."""
-        counts = Counter(
-            entry.disposition
-            for (name, _), entries in sorted(self.entries.items())
-            if robot in (None, name)
-            for entry in entries
-        )
-        return dict(sorted(counts.items()))
+        of = (entries for (name, _), entries in self.entries.items() if robot in (None, name))
+        return dict(sorted(Counter(e.disposition for entries in of for e in entries).items()))
 
     def statement(self) -> str:
         """Describe the result in one sentence."""
@@ -101,33 +93,23 @@ class Ledger:
         sentence = (
             f"each of {self.measurements:,} measurements has exactly one disposition: {parts}"
         )
-        gone = sum(self.totals(robot).get(IN_SUBMAP, 0) for robot in self.withdrawn)
         if not self.withdrawn:
             return sentence
+        gone = sum(self.totals(robot).get(IN_SUBMAP, 0) for robot in self.withdrawn)
         gone_with = ", ".join(self.withdrawn)
         return f"{sentence}; {gone:,} of those in submaps are withdrawn with {gone_with}"
 
     def to_json(self) -> dict[str, Any]:
         """Totals, violations, rejected measurements, and measurements and maps of each submap."""
-        counts = Counter(
-            (*stream, entry.submap)
-            for stream, entries in self.entries.items()
-            for entry in entries
-            if entry.submap is not None
-        )
+        counts = Counter((*of, e.submap) for of, own in self.entries.items() for e in own)
         robots = in_order({robot for robot, _ in self.entries})
+        columns = "robot", "incarnation", "sequence"
         return {
             "measurements": self.measurements,
             "dispositions": self.totals(),
             "robots": {robot: self.totals(robot) for robot in robots},
             "submaps": [
-                {
-                    "robot": n[0],
-                    "incarnation": n[1],
-                    "sequence": n[2],
-                    "measurements": counts[n],
-                    "maps": maps,
-                }
+                {**dict(zip(columns, n, strict=True)), "measurements": counts[n], "maps": maps}
                 for n, maps in sorted(self.maps.items())
             ],
             "rejected": [asdict(each) for each in self.rejected],
@@ -140,24 +122,27 @@ class Ledger:
 def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> Ledger:
     """Compute the ledger of a log; raises RerunError without a robot's configuration."""
     offenders = [
-        f"{_named(r)} is in the log twice with different contents" for r in log.contradicted
+        f"measurement {each.number} of {_name((each.robot, each.incarnation))} is in the log twice "
+        "with different contents"
+        for each in log.contradicted
     ]
-    streams = sorted(log.measurements.keys() | log.submaps().keys())
     entries = {}
     outliers: list[Outliers] = []
-    for stream in streams:
+    for stream in sorted(log.measurements.keys() | log.submaps().keys()):
         progress(stream[0])
-        intervals, wrong = _intervals(log, stream)
-        entries[stream], more = _entries(log, stream, intervals)
+        submaps, wrong = _submaps_of(log, stream)
+        entries[stream], more = _entries(log, stream, submaps)
         offenders += [*wrong, *more, *_contradictions(log, stream, entries[stream])]
         outliers += [
             Outliers(*stream, s.sequence, s.start_ns / 1e9, s.stamp_ns / 1e9, s.gated)
-            for s in intervals
+            for s in submaps
             if s.gated
         ]
     maps, unknown = _maps(log)
     rejected = tuple(_rejected(log, entries))
-    return Ledger(entries, maps, (*offenders, *unknown), _withdrawn(log), rejected, tuple(outliers))
+    last = log.of(m.FusedMap, ch.FUSED_MAP, ch.FINAL_MAP)[-1:]
+    withdrawn = last[0].withdrawn if last else ()
+    return Ledger(entries, maps, (*offenders, *unknown), withdrawn, rejected, tuple(outliers))
 
 
 def _rejected(log: Recorded, entries: Mapping[Stream, Sequence[Entry]]) -> Iterator[Rejected]:
@@ -177,27 +162,18 @@ def _rejected(log: Recorded, entries: Mapping[Stream, Sequence[Entry]]) -> Itera
             )
 
 
-def _withdrawn(log: Recorded) -> tuple[str, ...]:
-    last = next(iter(reversed((*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)))), None)
-    return last.withdrawn if isinstance(last, m.FusedMap) else ()
+def _name(stream: Stream) -> str:
+    return f"{stream[0]}, incarnation {stream[1]}"
 
 
-def _named(measurement: m.Measurement) -> str:
-    return (
-        f"measurement {measurement.number} of {measurement.robot}, incarnation "
-        f"{measurement.incarnation}"
-    )
-
-
-def _intervals(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
-    robot, incarnation = stream
+def _submaps_of(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str]]:
     found: dict[int, m.Submap] = {}
     wrong = []
-    for submap in log.of(ch.SUBMAP):
-        if not isinstance(submap, m.Submap) or (submap.robot, submap.incarnation) != stream:
+    for submap in log.of(m.Submap, ch.SUBMAP):
+        if (submap.robot, submap.incarnation) != stream:
             continue
         if found.setdefault(submap.sequence, submap) != submap:
-            name = f"submap {submap.sequence} of {robot}, incarnation {incarnation}"
+            name = f"submap {submap.sequence} of {_name(stream)}"
             wrong.append(f"{name} is in the log twice with different contents")
     return [found[k] for k in sorted(found)], wrong
 
@@ -206,12 +182,11 @@ def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
     """Entry of every existing or announced measurement, and violations."""
-    robot, incarnation = stream
     measurements: Mapping[int, m.Measurement] = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
     if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):
         raise RerunError(
-            f"{count:,} measurements of {robot}, incarnation {incarnation}, are announced, "
+            f"{count:,} measurements of {_name(stream)}, are announced, "
             f"{len(measurements):,} are in the log: too many are missing to list"
         )
     holder: list[int | None] = [None] * count
@@ -219,21 +194,21 @@ def _entries(
     for submap in submaps:
         for counter in range(submap.first_measurement, submap.last_measurement + 1):
             if counter >= count:
-                name = f"submap {submap.sequence} of {robot}, incarnation {incarnation}"
+                name = f"submap {submap.sequence} of {_name(stream)}"
                 wrong.append(f"{name} uses measurement {counter}, which the log does not have")
                 break
             if holder[counter] is not None:
                 wrong.append(
-                    f"measurement {counter} of {robot}, incarnation {incarnation} is in two "
-                    f"submaps: {holder[counter]} and {submap.sequence}"
+                    f"measurement {counter} of {_name(stream)} is in two submaps: "
+                    f"{holder[counter]} and {submap.sequence}"
                 )
             holder[counter] = submap.sequence
-    disposition_of = dispositions(log, robot, incarnation)
+    disposition_of = dispositions(log, *stream)
     last = max((s.last_measurement for s in submaps), default=-1)
     consumed = log.reported.get(stream, 0)
     entries = []
     for counter in range(count):
-        name = f"measurement {counter} of {robot}, incarnation {incarnation}"
+        name = f"measurement {counter} of {_name(stream)}"
         in_submap = counter in measurements and holder[counter] is not None
         disposition = disposition_of.get(counter, IN_SUBMAP if in_submap else LOST)
         if counter not in measurements and holder[counter] is not None:
@@ -251,52 +226,39 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
 
     A resumed robot counts earlier measurements as in submaps, so only its sum is compared.
     """
-    for done in log.of(ch.ROBOT_DONE):
-        if not isinstance(done, m.Done) or (done.robot, done.incarnation) != stream:
+    for done in log.of(m.Done, ch.ROBOT_DONE):
+        if (done.robot, done.incarnation) != stream:
             continue
         announced = {d.disposition: d.measurements for d in done.ledger}
         if sum(announced.values()) != done.measurements:
-            yield (
-                f"{done.robot}, incarnation {done.incarnation}: {done.measurements} "
-                f"measurements, {announced} dispositions"
-            )
-        resumed = "start pose" not in announced
-        found = Counter(entry.disposition for entry in entries[: done.measurements])
-        if not resumed and dict(found) != announced:
-            yield (
-                f"{done.robot}, incarnation {done.incarnation} reports {announced}, the log has "
-                f"{dict(found)}"
-            )
+            yield f"{_name(stream)}: {done.measurements} measurements, {announced} dispositions"
+        found = dict(Counter(entry.disposition for entry in entries[: done.measurements]))
+        if "start pose" in announced and found != announced:
+            yield f"{_name(stream)} reports {announced}, the log has {found}"
 
 
 def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
     users: dict[SubmapName, list[str]] = {
-        (s.robot, s.incarnation, s.sequence): []
-        for s in log.of(ch.SUBMAP)
-        if isinstance(s, m.Submap)
+        (s.robot, s.incarnation, s.sequence): [] for s in log.of(m.Submap, ch.SUBMAP)
     }
     wrong = []
-    for fused in (*log.of(ch.FUSED_MAP), *log.of(ch.FINAL_MAP)):
-        if not isinstance(fused, m.FusedMap) or fused.rule != "join":
+    for fused in log.of(m.FusedMap, ch.FUSED_MAP, ch.FINAL_MAP):
+        if fused.rule != "join":
             continue
         digest = fused.digest.hex()
         streams = Counter((x.robot, x.incarnation) for x in fused.members)
-        wrong += [
-            f"map {digest} counts {s[0]}, incarnation {s[1]} twice"
-            for s, n in streams.items()
-            if n > 1
-        ]
+        wrong += [f"map {digest} counts {_name(s)} twice" for s, n in streams.items() if n > 1]
         wrong += [
             f"map {digest} uses submaps of {robot}, which it lists as withdrawn"
             for robot, _ in streams
             if robot in fused.withdrawn
         ]
         for member in fused.members:
+            stream = member.robot, member.incarnation
             for sequence in range(member.sequence + 1):
-                name = (member.robot, member.incarnation, sequence)
-                if name not in users:
-                    what = f"submap {sequence} of {member.robot}, incarnation {member.incarnation}"
+                if (*stream, sequence) not in users:
+                    what = f"submap {sequence} of {_name(stream)}"
                     wrong.append(f"map {digest} uses {what}, which is not in the log")
                     break
-                users[name].append(digest)
+                users[*stream, sequence].append(digest)
     return {name: tuple(digests) for name, digests in users.items()}, wrong

@@ -1,5 +1,6 @@
 """Names and texts for display."""
 
+import json
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import PurePath
@@ -21,6 +22,14 @@ def data_set_name(path: str | PurePath) -> str:
     """Name of a data set's folder or file, without suffix."""
     place = PurePath(path)
     return place.stem if place.suffix in PACKED else place.name
+
+
+def data_set_of(scenario: str) -> str:
+    """Name of the data set in a scenario's JSON text, or empty."""
+    try:
+        return data_set_name(json.loads(scenario)["world"]["path"])
+    except (ValueError, LookupError, TypeError):
+        return ""
 
 
 def in_order(names: Iterable[str]) -> list[str]:

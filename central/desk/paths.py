@@ -39,10 +39,9 @@ def smoothed_paths(
 ) -> dict[str, SmoothedPath]:
     """Compute the path of every robot in the final map; progress receives each name."""
     last: dict[tuple[str, int, int], m.Trajectory] = {}
-    for message in found.of(ch.TRAJECTORY):
-        if isinstance(message, m.Trajectory):
-            begin = int(stamps(message.stamps, "stamps")[0])
-            last[message.robot, message.incarnation, begin] = message
+    for message in found.of(m.Trajectory, ch.TRAJECTORY):
+        begin = int(stamps(message.stamps, "stamps")[0])
+        last[message.robot, message.incarnation, begin] = message
     by_robot: dict[str, list[SmoothedPath]] = {}
     for (robot, incarnation, _), message in sorted(last.items()):
         progress(robot)

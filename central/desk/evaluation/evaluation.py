@@ -24,24 +24,17 @@ from teamslam.central.desk.evaluation.errors import (
     distance_rmse,
     interpolate_truth,
     map_errors,
-    pose_errors,
     rigid_alignment,
     transform_points,
 )
 from teamslam.central.desk.evaluation.log import Collected, collect_log
 from teamslam.central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
-from teamslam.central.desk.evaluation.robot import (
-    Consumption,
-    RobotLog,
-    consumption,
-    peer_results,
-    robot_log,
-)
+from teamslam.central.desk.evaluation.robot import peer_results, robot_result
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.evaluation.states import robot_states
 from teamslam.central.desk.evaluation.verdicts import verdicts_given
-from teamslam.central.desk.names import data_set_name, in_order
+from teamslam.central.desk.names import data_set_of, in_order
 from teamslam.central.diagnosis import contradicts
 from teamslam.central.team_config import TeamConfig, team_config
 from teamslam.team import translate
@@ -72,13 +65,18 @@ TeamMotion = tuple[Float[np.ndarray, "3"], str]
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
     """Evaluate one run from its samples in log order."""
     log = collect_log(samples)
-    scenario = _scenario(log)
+    world, scenario = log.newest(ch.WORLD_CONFIG, m.Configuration), None
+    if world is not None:
+        with suppress(ValueError):
+            scenario = team_config(world.configuration)
     truth = log.newest(ch.TRUTH_LANDMARKS, m.TruthLandmarks)
     true = TrueLandmarks() if truth is None else TrueLandmarks.of(truth)
     association = association_result(log)
     label_of = {} if association is None else association.label_of
     message = log.newest(ch.FINAL_MAP, m.FusedMap)
-    frames = _frames(log)
+    frames = TruthFrames()
+    for start in log.of_all(ch.START, m.InitialPose):
+        frames.take(start)
     arbitrary = _is_arbitrary(frames, message)
 
     def is_in_frame(frame: str) -> bool:
@@ -86,22 +84,16 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
             return frames.has(frame)
         return message is None or not message.ids or frame in {"", message.frame}
 
-    logs = {robot: robot_log(log, robot, is_in_frame) for robot in log.robots}
-    truth_from_map = _motion(logs.values()) if arbitrary else np.zeros(3)
+    robots = {}
+    for robot in log.robots:
+        uplink = _uplink_bytes(log, scenario, robot)
+        robots[robot] = robot_result(log, robot, uplink, own_map(log, robot, true), is_in_frame)
+    truth_from_map = _motion(robots.values()) if arbitrary else np.zeros(3)
     fused = None
     if message is not None:
         fused = map_result(log, message, true, label_of, truth_from_map, arbitrary=arbitrary)
-    motion = _team_motion(fused, logs.values())
-    robots = {
-        robot: _robot_result(
-            logs[robot],
-            consumption(log, robot),
-            _uplink_bytes(log, scenario, robot),
-            motion,
-            own_map(log, robot, true),
-        )
-        for robot in log.robots
-    }
+    motion = _team_motion(fused, robots.values())
+    robots = {name: _aligned(robot, motion) for name, robot in robots.items()}
     end = log.newest(ch.END, m.End)
     faults = log.of_all(ch.FAULT, m.Fault)
     streams = _streams(log)
@@ -131,7 +123,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
             log, message, () if scenario is None else [each.id for each in scenario.robots]
         ),
         verdicts=verdicts_given(log),
-        data_set=_data_set(log),
+        data_set="" if world is None else data_set_of(world.configuration),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
         separate_times=streams.separate_times,
         mirrored=streams.mirrored,
@@ -175,13 +167,6 @@ def _config(log: Collected, robot: str) -> RobotConfig:
             text = with_current_names(msgspec.json.decode(announced.configuration))
             return msgspec.convert(text, RobotConfig)
     return RobotConfig(robot)
-
-
-def _frames(log: Collected) -> TruthFrames:
-    frames = TruthFrames()
-    for start in log.of_all(ch.START, m.InitialPose):
-        frames.take(start)
-    return frames
 
 
 def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
@@ -230,34 +215,6 @@ def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
     return replace(evaluation, notes=(*evaluation.notes, *lost))
 
 
-def _scenario(log: Collected) -> TeamConfig | None:
-    message = log.newest(ch.WORLD_CONFIG, m.Configuration)
-    if message is None:
-        return None
-    try:
-        return team_config(message.configuration)
-    except ValueError:
-        return None
-
-
-class _Place(msgspec.Struct):
-    path: str = ""
-
-
-class _World(msgspec.Struct):
-    world: _Place
-
-
-def _data_set(log: Collected) -> str:
-    message = log.newest(ch.WORLD_CONFIG, m.Configuration)
-    if message is None:
-        return ""
-    try:
-        return data_set_name(msgspec.json.decode(message.configuration, type=_World).world.path)
-    except (msgspec.MsgspecError, UnicodeEncodeError):
-        return ""
-
-
 def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | None:
     """Bytes of the channels that the team's rule consumes; None for an invalid pair."""
     named = None if team is None else PAIRS.get((team.estimator, team.fusion))
@@ -267,36 +224,18 @@ def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | 
     return sum(log.traffic[key].bytes for key in keys if key in log.traffic)
 
 
-def _robot_result(
-    log: RobotLog,
-    used: Consumption,
-    uplink_bytes: int | None,
-    team_motion: TeamMotion | None,
-    own_map: MapErrors | None,
-) -> RobotResult:
-    smoothed = pose_errors(log.smoothed, log.smoothed_covariances, log.truth)
-    ends_known = smoothed is not None and smoothed.stamps_ns[-1] == log.smoothed.stamps_ns[-1]
-    motion, alignment = team_motion or (_motion([log]), "trajectory")
-    aligned = None if motion is None else _moved_rmse(motion, log.smoothed, log.truth)
-    return RobotResult(
-        consumption=used,
-        uplink_bytes=uplink_bytes,
-        truth=log.truth,
-        smoothed_path=log.smoothed,
-        smoothed=smoothed,
-        online_path=log.online,
-        online=pose_errors(log.online, log.online_covariances, log.truth),
-        online_channel=log.online_channel,
-        final_pose_nees_per_dof=float(smoothed.nees[-1]) / 3.0
-        if smoothed is not None and ends_known
-        else None,
+def _aligned(robot: RobotResult, team_motion: TeamMotion | None) -> RobotResult:
+    """Add the aligned errors; without a motion of the team the robot's own path is aligned."""
+    motion, alignment = team_motion or (_motion([robot]), "trajectory")
+    aligned = None if motion is None else _moved_rmse(motion, robot.smoothed_path, robot.truth)
+    online = None
+    if team_motion is not None:
+        online = _moved_rmse(team_motion[0], robot.online_path, robot.truth)
+    return replace(
+        robot,
         aligned_rmse_m=aligned,
         alignment=None if aligned is None else alignment,
-        online_aligned_rmse_m=None
-        if team_motion is None
-        else _moved_rmse(team_motion[0], log.online, log.truth),
-        own_map=own_map,
-        outside=log.outside,
+        online_aligned_rmse_m=online,
     )
 
 
@@ -307,21 +246,21 @@ def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> floa
     return distance_rmse(transform_points(motion, path.poses[known, :2]), true_poses[known, :2])
 
 
-def _team_motion(fused: MapResult | None, logs: Iterable[RobotLog]) -> TeamMotion | None:
+def _team_motion(fused: MapResult | None, robots: Iterable[RobotResult]) -> TeamMotion | None:
     if fused is None:
         return None
     if fused.errors is not None and fused.errors.truth_from_map is not None:
         return fused.errors.truth_from_map, "map"
-    motion = _motion(logs)
+    motion = _motion(robots)
     return None if motion is None else (motion, "paths")
 
 
-def _motion(logs: Iterable[RobotLog]) -> Float[np.ndarray, "3"] | None:
+def _motion(robots: Iterable[RobotResult]) -> Float[np.ndarray, "3"] | None:
     true_places, places = [np.empty((0, 2))], [np.empty((0, 2))]
-    for log in logs:
-        truth, known = interpolate_truth(log.truth, log.smoothed.stamps_ns)
+    for robot in robots:
+        truth, known = interpolate_truth(robot.truth, robot.smoothed_path.stamps_ns)
         true_places.append(truth[known, :2])
-        places.append(log.smoothed.poses[known, :2])
+        places.append(robot.smoothed_path.poses[known, :2])
     return rigid_alignment(np.concatenate(true_places), np.concatenate(places))
 
 

@@ -56,12 +56,8 @@ class Innovations:
 
 @dataclass(frozen=True)
 class Latencies:
-    """Wall time [s] from measurement to first map, of one robot's used submaps.
+    """Wall time [s] from the publication of a submap's first, last measurement to its first map."""
 
-    stamps_ns: submap end. first, last: from publication of its first and last measurement.
-    """
-
-    stamps_ns: Int64[np.ndarray, " n"]
     first_s: Float[np.ndarray, " n"]
     last_s: Float[np.ndarray, " n"]
 
@@ -126,27 +122,22 @@ class _Clocks:
 
 
 @dataclass
-class _Submap:
-    """Submap that no map has used."""
-
-    end_ns: int
-    first_measurement: int
-    last_measurement: int
-
-
-@dataclass
 class _Gathering:
-    innovations: dict[str, list[m.Innovation]] = field(default_factory=lambda: defaultdict(list))
+    innovations: dict[str, dict[tuple[int, int], m.Innovation]] = field(
+        default_factory=lambda: defaultdict(dict)
+    )
+    """By (incarnation, window): a resumed robot repeats some."""
     map_nees: _Column = field(default_factory=_Column)
     map_cost: _Column = field(default_factory=_Column)
     robot_cost: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
     detector: EventDetector = field(default_factory=EventDetector)
     events: list[Event] = field(default_factory=list)
     published: dict[tuple[str, int], _Clocks] = field(default_factory=lambda: defaultdict(_Clocks))
-    unused: dict[tuple[str, int], dict[int, _Submap]] = field(
+    unused: dict[tuple[str, int], dict[int, tuple[int, int]]] = field(
         default_factory=lambda: defaultdict(dict)
     )
-    latencies: dict[str, list[tuple[int, float, float]]] = field(
+    """First and last measurement of the submaps that no map has used, by stream and sequence."""
+    latencies: dict[str, list[tuple[float, float]]] = field(
         default_factory=lambda: defaultdict(list)
     )
     truth: TrueLandmarks = field(default_factory=TrueLandmarks)
@@ -156,8 +147,9 @@ class _Gathering:
 
     def take(self, sample: Sample) -> None:
         self.logged_ns = _extend(self.logged_ns, sample.stamp_ns)
-        if ch.row_of(sample.key) in ch.SENSORS:
-            self._take_measurement(sample)
+        if ch.row_of(sample.key) in ch.SENSORS and (head := head_of(sample)) is not None:
+            self.published[head.robot, head.incarnation].take(head.number, sample.wall_ns)
+            self.measured_ns = _extend(self.measured_ns, sample.stamp_ns)
         self.take_contents(sample)
 
     def take_contents(self, sample: Sample) -> None:
@@ -170,14 +162,13 @@ class _Gathering:
         del self.events[MOST:]
         match message:
             case m.Submap():
-                interval = _Submap(
-                    message.stamp_ns, message.first_measurement, message.last_measurement
-                )
-                self.unused[message.robot, message.incarnation][message.sequence] = interval
+                span = message.first_measurement, message.last_measurement
+                self.unused[message.robot, message.incarnation][message.sequence] = span
             case m.FusedMap():
                 self._take_map(message, sample.wall_ns)
             case m.Innovation():
-                self.innovations[message.robot].append(message)
+                window = message.incarnation, message.sequence
+                self.innovations[message.robot][window] = message
             case m.InitialPose():
                 self.frames.take(message)
             case m.TruthLandmarks():
@@ -185,19 +176,10 @@ class _Gathering:
             case m.Status() if name == "central":
                 for figure, value in message.figures.items():
                     if figure.startswith(_COST):
-                        robot = figure.removeprefix(_COST)
-                        self.robot_cost[robot].take(message.stamp_ns, value)
+                        of_robot = self.robot_cost[figure.removeprefix(_COST)]
+                        of_robot.take(message.stamp_ns, value)
             case _:
                 pass
-
-    def _take_measurement(self, sample: Sample) -> None:
-        measurement = head_of(sample)
-        if measurement is None:
-            return
-        self.published[measurement.robot, measurement.incarnation].take(
-            measurement.number, sample.wall_ns
-        )
-        self.measured_ns = _extend(self.measured_ns, sample.stamp_ns)
 
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:
@@ -208,16 +190,12 @@ class _Gathering:
         for member in fused.members:
             waiting = self.unused[member.robot, member.incarnation]
             for sequence in [k for k in waiting if k <= member.sequence]:
-                submap = waiting.pop(sequence)
-                self._arrived(member.robot, member.incarnation, submap, wall_ns)
-
-    def _arrived(self, robot: str, incarnation: int, submap: _Submap, wall_ns: int) -> None:
-        clocks = self.published[robot, incarnation]
-        first_ns, last_ns = clocks.of(submap.first_measurement), clocks.of(submap.last_measurement)
-        if not first_ns or not last_ns:
-            return  # partial log: the measurement precedes it; 0: recomputed, without wall time
-        first, last = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
-        self.latencies[robot].append((submap.end_ns, first, last))
+                clocks = self.published[member.robot, member.incarnation]
+                first_ns, last_ns = map(clocks.of, waiting.pop(sequence))
+                # Without one the log is partial; 0: recomputed, without wall time.
+                if first_ns and last_ns:
+                    latency = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
+                    self.latencies[member.robot].append(latency)
 
 
 def history(samples: Iterable[Sample]) -> History:
@@ -240,7 +218,8 @@ def history(samples: Iterable[Sample]) -> History:
         map_cost=found.map_cost.series,
         robot_cost={robot: found.robot_cost[robot].series for robot in in_order(found.robot_cost)},
         latencies={
-            robot: _latencies(found.latencies[robot]) for robot in in_order(found.latencies)
+            robot: Latencies(*map(np.array, zip(*found.latencies[robot], strict=True)))
+            for robot in in_order(found.latencies)
         },
         events=tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
     )
@@ -250,17 +229,10 @@ def _extend(span_ns: tuple[int, int], stamp_ns: int) -> tuple[int, int]:
     return min(span_ns[0], stamp_ns), max(span_ns[1], stamp_ns)
 
 
-def _innovations(of: list[m.Innovation]) -> Innovations:
-    """Innovations by window, once each: a resumed robot repeats some."""
-    once = {(each.incarnation, each.sequence): each for each in of}
-    ordered = [once[name] for name in sorted(once)]
+def _innovations(of: Mapping[tuple[int, int], m.Innovation]) -> Innovations:
+    ordered = [of[window] for window in sorted(of)]
     return Innovations(
         np.array([each.stamp_ns for each in ordered], np.int64),
         np.array([each.squared for each in ordered]),
         np.array([each.dof for each in ordered], np.int64),
     )
-
-
-def _latencies(of: list[tuple[int, float, float]]) -> Latencies:
-    stamps, first, last = zip(*of, strict=True)
-    return Latencies(np.array(stamps, np.int64), np.array(first), np.array(last))

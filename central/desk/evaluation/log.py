@@ -21,36 +21,22 @@ from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError, decoded
 
 M = TypeVar("M", bound=m.Message)
-_SENSORS = frozenset(channel.name for channel in ch.SENSORS)
 _TIMED: tuple[type[m.AnyOdometry | m.AnyScan], ...] = (
     m.Odometry, m.Increment, m.Steering, m.Observations, m.Points,
 )  # fmt: skip
 _TIMED_TAGS = frozenset(str(each.__struct_config__.tag) for each in _TIMED)
-_NEWEST = (
+_SENSORS = frozenset(ch.SENSORS)
+_NEWEST = frozenset((
     ch.CONCLUDED, ch.WORLD_CONFIG, ch.ROBOT_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END,
     ch.STATUS, ch.OWN_MAP,
-)  # fmt: skip
-_LATEST = frozenset(channel.name for channel in _NEWEST)
-_COLLECTED = frozenset(
-    channel.name
-    for channel in (
-        ch.FAULT,
-        ch.TRUTH,
-        ch.TRUTH_LABELS,
-        ch.TRUTH_POSITIONS,
-        ch.ASSOCIATION,
-        ch.TRAJECTORY,
-        ch.OWN_POSE,
-        ch.TEAM_POSE,
-        ch.CENTRAL_POSE,
-        ch.SUBMAP,
-        ch.ROBOT_DONE,
-        ch.VERDICT,
-        ch.WITHDRAWAL,
-        ch.ORDER,
-    )
-)
-_OF_A_ROBOT = frozenset(channel.name for channel in (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE))
+))  # fmt: skip
+"""Channels whose newest message is collected; of others all are."""
+_COLLECTED = frozenset((
+    ch.FAULT, ch.TRUTH, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS, ch.ASSOCIATION, ch.TRAJECTORY,
+    ch.OWN_POSE, ch.TEAM_POSE, ch.CENTRAL_POSE, ch.SUBMAP, ch.ROBOT_DONE, ch.VERDICT, ch.WITHDRAWAL,
+    ch.ORDER, ch.START,
+))  # fmt: skip
+_OF_A_ROBOT = (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE)
 
 
 class Head(msgspec.Struct, array_like=True, gc=False):
@@ -84,7 +70,7 @@ class Traffic:
 
 @dataclass
 class Measurements:
-    """Measurements of one robot as (incarnation, measurement)."""
+    """Measurements of one robot as (incarnation, number)."""
 
     all: set[tuple[int, int]] = field(default_factory=set)
     odometry: set[tuple[int, int]] = field(default_factory=set)
@@ -111,12 +97,10 @@ class Collected:
     @property
     def robots(self) -> list[str]:
         """Robots with measurements or truth, by name."""
-        names = set(self.measurements)
-        for key in self.traffic:
-            found = channel_of(key)
-            if found is not None and found[0].name in _OF_A_ROBOT:
-                names.add(found[1])
-        return in_order(names)
+        found = filter(None, map(channel_of, self.traffic))
+        return in_order(
+            self.measurements.keys() | {name for channel, name in found if channel in _OF_A_ROBOT}
+        )
 
     def newest(self, channel: Channel, kind: type[M], name: str = "") -> M | None:
         """Newest valid message of a channel."""
@@ -149,30 +133,21 @@ class Collected:
 
     def take(self, sample: Sample) -> None:
         """Count a sample, and store it if its channel is collected."""
-        known = channel_of(sample.key)
-        channel, robot = ("", "") if known is None else (known[0].name, known[1])
         if self.first_ns is None and sample.wall_ns:
             self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
         traffic.messages += 1
         traffic.bytes += len(sample.payload)
-        if channel == ch.START.name:
-            self.samples[sample.key].append(sample)
-        if channel in _SENSORS:
-            self._count(sample, robot, odometry=channel == ch.ODOMETRY.name)
-        else:
-            self._keep(sample, channel)
+        self.keep(sample)
+        if (known := channel_of(sample.key)) is not None and known[0] in _SENSORS:
+            self._count(sample, known[1], odometry=known[0] is ch.ODOMETRY)
 
     def keep(self, sample: Sample) -> None:
-        """Store a message in the centre's place, without its traffic."""
-        found = channel_of(sample.key)
-        if found is not None:
-            self._keep(sample, found[0].name)
-
-    def _keep(self, sample: Sample, channel: str) -> None:
-        if channel in _LATEST:
+        """Store a message if its channel is collected, without its traffic."""
+        known = channel_of(sample.key)
+        if known is not None and known[0] in _NEWEST:
             self.latest[sample.key] = sample
-        elif channel in _COLLECTED:
+        elif known is not None and known[0] in _COLLECTED:
             self.samples[sample.key].append(sample)
 
     def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
@@ -198,13 +173,12 @@ class Collected:
 
 
 def collect_log(samples: Iterable[Sample]) -> Collected:
-    """Collect a log's contents from its samples."""
+    """Collect a log's contents."""
     found = Collected()
     centre = PeersAsCentre()
     for sample in samples:
         found.take(sample)
-        counterpart = centre.of(sample)
-        if counterpart is not None:
+        if (counterpart := centre.of(sample)) is not None:
             found.keep(counterpart)
     found.disagreement = centre.agreement.disagreement
     largest = centre.agreement.largest

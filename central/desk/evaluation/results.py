@@ -14,7 +14,6 @@ from teamslam.central.desk.evaluation.clocks import Late, clock_cause, is_refute
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, PoseErrors
 from teamslam.central.desk.evaluation.log import Traffic
 from teamslam.central.desk.evaluation.matching import Gospa, Matching
-from teamslam.central.desk.evaluation.robot import Consumption, PeerResult
 from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import contradicts, describe
@@ -23,6 +22,8 @@ from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 
+REJECTED = "rejected: "
+"""Prefix of a rejected measurement's disposition."""
 USUAL = ("hybrid", "join")
 """Default estimator and rule."""
 
@@ -34,14 +35,77 @@ def figure(of: object, path: str) -> Any:
     return of
 
 
+@dataclass(frozen=True)
+class Consumption:
+    """Dispositions of the measurements on a robot's sensor channels.
+
+    steps: odometry intervals. published: distinct measurements. consumed, ledger: from the robot's
+    `Done`. each_once: no measurement is in two submaps, and the ledger sums to consumed. gated:
+    detections that windows rejected as outliers.
+    """
+
+    steps: int
+    published: int
+    consumed: int | None
+    submaps: int
+    ledger: Mapping[str, int]
+    each_once: bool | None
+    gated: int = 0
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Rejected measurements by reason, most frequent first."""
+        found = [
+            (count, disposition.removeprefix(REJECTED))
+            for disposition, count in self.ledger.items()
+            if disposition.startswith(REJECTED) and count
+        ]
+        return {reason: count for count, reason in sorted(found, key=lambda each: -each[0])}
+
+    @property
+    def used(self) -> int | None:
+        """Number of measurements in the map, or used as initial pose."""
+        if not self.ledger:
+            return None
+        return sum(self.ledger.values()) - sum(self.rejected.values())
+
+    @property
+    def open(self) -> int | None:
+        """Number of published measurements neither used nor rejected."""
+        return None if self.consumed is None else self.published - self.consumed
+
+    @property
+    def not_used(self) -> str:
+        """Describe rejected and open measurements with reasons."""
+        parts = [f"{count} rejected ({reason})" for reason, count in self.rejected.items()]
+        return ", ".join([*parts, f"{self.open} open"] if self.open else parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerResult:
+    """Announced conclusion of one peer.
+
+    complete_at_s: wall time from log start to its final map. have: submaps by robot. over: new
+    members by relaying node. agrees_with: number of peers with the same set.
+    """
+
+    final_map_sha256: str | None
+    submaps: int
+    complete_at_s: float | None
+    uplink_bytes: int | None
+    downlink_bytes: int | None
+    agrees_with: int
+    have: Mapping[str, int] = field(default_factory=dict)
+    over: Mapping[str, int] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, kw_only=True)
 class MapResult:
     """Final map: L landmarks by id and their covariance (blocks unless `joint`).
 
-    truth: true positions, zero unless `known`; errors: of the known rows. cost_per_dof: χ² of the
-    join. covariance_scale: factor to apply to submap covariances. lost: incomplete robots. gospa:
-    of all landmarks. matching: of unnamed landmarks. changes: against saved maps. diagnosis: causes
-    of misfit, best first.
+    truth: true positions, zero unless `known`, whose errors count. cost_per_dof: χ² of the join.
+    covariance_scale: factor to apply to submap covariances. matching: of unnamed landmarks.
+    changes: against saved maps. diagnosis: causes of misfit, best first.
     """
 
     rule: str
@@ -72,9 +136,9 @@ class RobotResult:
     """One robot: dispositions of its measurements, and its poses against the truth.
 
     smoothed: final map's poses at submap ends. online: poses published during the run, on
-    `online_channel`. aligned_rmse_m, online_aligned_rmse_m: after the rigid motion that aligns the
-    map (`alignment`: "map"), or all smoothed paths ("paths"), or the robot's own path
-    ("trajectory"). own_map: unaligned. outside: running poses are not in the team's frame.
+    "team/pose", "central/pose" or "own/pose" (`online_channel`). aligned: after the rigid motion
+    that aligns the map (`alignment`: "map"), or all smoothed paths ("paths"), or the robot's own
+    path ("trajectory"). own_map: unaligned. outside: running poses are not in the team's frame.
     """
 
     consumption: Consumption
@@ -85,12 +149,18 @@ class RobotResult:
     online_path: Path
     online: PoseErrors | None
     online_channel: str | None
-    final_pose_nees_per_dof: float | None
-    aligned_rmse_m: float | None
-    alignment: str | None
-    online_aligned_rmse_m: float | None
+    aligned_rmse_m: float | None = None
+    alignment: str | None = None
+    online_aligned_rmse_m: float | None = None
     own_map: MapErrors | None = None
     outside: bool = False
+
+    @property
+    def final_pose_nees_per_dof(self) -> float | None:
+        """NEES of the last smoothed pose, if it has truth."""
+        if self.smoothed is None or self.smoothed.stamps_ns[-1] != self.smoothed_path.stamps_ns[-1]:
+            return None
+        return float(self.smoothed.nees[-1]) / 3.0
 
     @property
     def uplink_bytes_per_step(self) -> float | None:
@@ -104,9 +174,9 @@ class Evaluation:
     """A run: scenario, map, robots and traffic.
 
     notes: remarks of the world, and messages set aside (number: faults). unsound: number of invalid
-    samples. arbitrary_frame: only aligned errors are meaningful. verdicts, separate_times: as text.
-    mirrored, lateness: by the measurements alone. recorded_ns: wall time of the first message.
-    truth_from_map: aligns landmarks with the true ones, or the paths.
+    samples. arbitrary_frame: only aligned errors are meaningful. mirrored, lateness: by the
+    measurements alone. recorded_ns: wall time of the first message. truth_from_map: aligns the
+    landmarks with the true ones, or the paths.
     """
 
     scenario: TeamConfig | None
@@ -169,15 +239,13 @@ class Evaluation:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Robots missing from the final map, and all landmarks if it has none: no success."""
+        """Robots missing from the final map, and all landmarks if it has none."""
         is_empty = self.map is not None and not len(self.map.ids)
         return (*not_in_the_map(self.states), *[NO_LANDMARK] * is_empty)
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Why the result is no success: missing robots, or measurements that contradict each other
-        by a covariance scale of MOST_SCALE or more.
-        """
+        """Reasons that make a result no success: missing robots, or contradicting measurements."""
         of_map = () if self.map is None else self.map.diagnosis
         if not any(contradicts(each) and not each.robot for each in of_map):
             return self.missing

@@ -14,6 +14,7 @@ from teamslam.central.desk.evaluation.errors import (
     interpolate_truth,
     join_batches,
     pose_errors,
+    rigid_alignment,
 )
 from teamslam.central.fused_map import START_POSES
 from teamslam.team import translate
@@ -56,8 +57,8 @@ class TruthFrames:
 class MapFit(NamedTuple):
     """Unaligned map errors of the landmarks that have truth.
 
-    nees_per_dof: eᵀ P⁻¹ e / 2K with the map's covariance P, as in the report; None for a running
-    map without cross-covariances. nees: of each landmark in its own covariance.
+    nees_per_dof: eᵀ P⁻¹ e / 2K with the map's covariance P; None for a running map without cross-
+    covariances. nees: of each landmark in its own covariance.
     """
 
     rmse_m: float
@@ -164,9 +165,9 @@ class RunningErrors:
 
     def known(self) -> PoseErrors | None:
         """Errors of the poses whose truth has arrived since the last call."""
-        until = int(self._truth[-1].stamps_ns[-1]) if self._truth else None
+        until = int(self._truth[-1].stamps_ns[-1]) if self._truth else -(2**63)
         due = []
-        while until is not None and self._poses and self._poses[0][0] <= until:
+        while self._poses and self._poses[0][0] <= until:
             due.append(self._poses.popleft())
         if not due:
             return None
@@ -198,3 +199,59 @@ class RunningErrors:
             if batch.stamps_ns[-1] > until_ns:
                 break
         return join_batches(batches)
+
+
+@dataclass
+class TruthAlignment:
+    """Truth of a team, and map_from_truth of its maps, as `evaluate` aligns the final map.
+
+    In a frame that no known initial pose or survey fixes, the true landmarks are aligned with those
+    of the map, or else the true with the smoothed paths.
+    """
+
+    landmarks: TrueLandmarks = field(default_factory=TrueLandmarks)
+    frames: TruthFrames = field(default_factory=TruthFrames)
+    _truth: dict[str, list[Path]] = field(default_factory=dict)
+    _smoothed: dict[tuple[str, int, int], Path] = field(default_factory=dict)
+
+    def take(self, message: m.Message) -> None:
+        """Store initial poses, truth and smoothed paths."""
+        match message:
+            case m.InitialPose():
+                self.frames.take(message)
+            case m.TruthLandmarks():
+                self.landmarks = TrueLandmarks.of(message)
+            case m.Truth():
+                stamps, poses = translate.trajectory_of(message)
+                kept = np.unique(stamps // SPACING_NS, return_index=True)[1]
+                batches = self._truth.setdefault(message.robot, [])
+                batches.append(Path(stamps[kept], poses[kept]))
+            case m.Trajectory():
+                path = Path(*translate.trajectory_of(message))
+                first = int(path.stamps_ns[0]) if len(path.stamps_ns) else 0
+                self._smoothed[message.robot, message.incarnation, first] = path
+            case _:
+                pass
+
+    def map_from_truth(self, fused: m.FusedMap | None) -> Float[np.ndarray, "3"] | None:
+        """Rigid motion (x [m], y [m], theta [rad]); None if undetermined.
+
+        Without landmarks the frame is that of the initial poses.
+        """
+        if fused is None or not fused.ids:
+            return None if self.frames.none_is_known else np.zeros(3)
+        if self.frames.has(fused.frame):
+            return np.zeros(3)
+        ids, means = translate.landmarks_of(fused)
+        true, known = self.landmarks.match(ids)
+        motion = rigid_alignment(means[known], true[known])
+        return self._align_paths() if motion is None else motion
+
+    def _align_paths(self) -> Float[np.ndarray, "3"] | None:
+        places, true_places = [np.empty((0, 2))], [np.empty((0, 2))]
+        for (robot, _, _), path in self._smoothed.items():
+            truth = join_batches(self._truth.get(robot, []))
+            poses, known = interpolate_truth(truth, path.stamps_ns)
+            places.append(path.poses[known, :2])
+            true_places.append(poses[known, :2])
+        return rigid_alignment(np.concatenate(places), np.concatenate(true_places))

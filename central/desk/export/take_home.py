@@ -77,8 +77,7 @@ def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
     config = None if "central" not in found.configured else found.central_config()[0]
     names = () if config is None else config.classes
     rows: dict[Member, Float[np.ndarray, " C"]] = {}
-    for submap in found.of(ch.SUBMAP):
-        assert isinstance(submap, m.Submap)
+    for submap in found.of(m.Submap, ch.SUBMAP):
         own = [each for each, _ in _detections(submap)]
         rows |= zip(own, translate.classes_of(submap, len(own)), strict=True)
     most = max((len(each) for each in rows.values()), default=0)
@@ -98,7 +97,7 @@ def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
 
 
 def _datum(found: Recorded) -> Datum | None:
-    maps = [each for each in found.of(ch.FINAL_MAP) if isinstance(each, m.FusedMap)]
+    maps = found.of(m.FusedMap, ch.FINAL_MAP)
     if not maps or "central" not in found.configured:
         return None
     return datum_of(found.central_config()[0], maps[-1], found.saved_maps.values())
@@ -112,7 +111,7 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
             if isinstance(message, m.Observations | m.Points):
                 named = ids(message.ids, "ids")
                 counts.update(named[named < UNNAMED].tolist())
-    seen = dict(chain.from_iterable(map(_detections, found.of(ch.SUBMAP))))
+    seen = dict(chain.from_iterable(map(_detections, found.of(m.Submap, ch.SUBMAP))))
     for member, identity in _members(found):
         counts[identity] += seen.get(member, 0)
     return counts
@@ -120,16 +119,14 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
 
 def _members(found: Recorded) -> Iterator[tuple[Member, int]]:
     """Submap landmarks in the final map, each with its number there."""
-    for fused in found.of(ch.FINAL_MAP)[-1:]:
-        assert isinstance(fused, m.FusedMap)
+    for fused in found.of(m.FusedMap, ch.FINAL_MAP)[-1:]:
         for of in fused.memberships:
             columns = [ids(each, "members") for each in (of.sequences, of.locals, of.identities)]
             for sequence, local, identity in np.transpose(columns).tolist():
                 yield (of.robot, of.incarnation, sequence, local), identity
 
 
-def _detections(submap: m.Message) -> Iterator[tuple[Member, int]]:
-    assert isinstance(submap, m.Submap)
+def _detections(submap: m.Submap) -> Iterator[tuple[Member, int]]:
     numbers = ids(submap.ids, "ids")
     unnamed = (numbers[numbers >= UNNAMED] - UNNAMED).tolist()
     for local, count in zip(unnamed, ids(submap.counts, "counts").tolist(), strict=True):

@@ -8,12 +8,7 @@ from typing import Any
 
 import msgspec
 
-from teamslam.central.desk.verification.recorded import (
-    Identity,
-    Recorded,
-    RerunError,
-    identity,
-)
+from teamslam.central.desk.verification.recorded import Identity, Recorded, RerunError, identity
 from teamslam.central.join_messages import Tail
 from teamslam.central.node import node_class
 from teamslam.central.submap_fold import RecordedFields, SubmapFold
@@ -26,8 +21,7 @@ from teamslam.team.wire.bus import Outgoing
 
 def recompute_centre(log: Recorded) -> dict[Identity, m.Message]:
     """Recompute messages from the inputs of the recorded maps, by input names."""
-    finals = [f for f in log.of(ch.FINAL_MAP) if isinstance(f, m.FusedMap)]
-    maps = [f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)]
+    maps, finals = (log.of(m.FusedMap, each) for each in (ch.FUSED_MAP, ch.FINAL_MAP))
     found: dict[Identity, m.Message] = {}
     for out in _recompute(log, maps, finals):
         found.setdefault(identity(out.key, out.message), out.message)
@@ -47,7 +41,7 @@ def recompute_peer(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
     def maps_on(channel: ch.Channel) -> list[m.FusedMap]:
         key = channel.key(robot)
-        own = (each.message for each in log.outputs if each.sample.key == key)
+        own = (each.message for each in log.outputs_of(channel) if each.sample.key == key)
         return [each for each in own if isinstance(each, m.FusedMap)]
 
     found: dict[Identity, m.Message] = {}
@@ -112,8 +106,8 @@ def recorded_map(log: Recorded, name: str) -> m.SavedMap:
 
     Raises RerunError without a final map, NothingToSaveError.
     """
-    found = [*log.of(ch.FINAL_MAP)] or [*log.of(ch.TEAM_FINAL)]
-    finals = [each for each in found if isinstance(each, m.FusedMap) and each.rule == "join"]
+    found = log.of(m.FusedMap, ch.FINAL_MAP) or log.of(m.FusedMap, ch.TEAM_FINAL)
+    finals = [each for each in found if each.rule == "join"]
     if not finals:
         raise RerunError("the log has no final map of the rule join")
     config, digest = log.central_config()
@@ -127,8 +121,6 @@ def recorded_map(log: Recorded, name: str) -> m.SavedMap:
 
 
 class _RecordedSet:
-    """Set of a log, and the parts named by its maps."""
-
     def __init__(self, log: Recorded) -> None:
         self._store = SubmapStore()
         sightings = log.sightings()
@@ -145,10 +137,8 @@ class _RecordedSet:
             self._store.add(saved)
         self._maps = log.saved_maps
         self._priors_of: dict[bytes, set[Stream]] = {}
-        for prior in (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR)):
-            if isinstance(prior, m.Prior):
-                stream = (prior.robot, prior.incarnation)
-                self._priors_of.setdefault(prior.digest, set()).add(stream)
+        for prior in log.of(m.Prior, ch.PRIOR, ch.TEAM_PRIOR):
+            self._priors_of.setdefault(prior.digest, set()).add((prior.robot, prior.incarnation))
 
     def chains(self, fused: m.FusedMap) -> Mapping[Stream, Sequence[m.Submap]] | None:
         """Submaps that a map names; None if one or its inputs are missing."""
@@ -171,17 +161,16 @@ class _RecordedSet:
                 for member in (*self._store.sightings(submap), submap):
                     store.add(member)
         for robot in fused.withdrawn:
-            order = m.Withdrawal(stamp_ns=fused.stamp_ns, robot=robot, by="log", reason="")
-            store.add(order)
+            store.add(m.Withdrawal(stamp_ns=fused.stamp_ns, robot=robot, by="log", reason=""))
         for each in fused.verdicts:
-            store.add(_verdict_on(each, fused.stamp_ns))
+            store.add(
+                m.Verdict(
+                    stamp_ns=fused.stamp_ns, robot=each.first.robot, judgement=each, by="log",
+                    reason="",
+                )
+            )  # fmt: skip
 
     def fields(self, fused: m.FusedMap) -> RecordedFields:
         """Fields of a map that do not follow from its set."""
         priors_of = self._priors_of.get(fused.digest, set())
         return RecordedFields(fused.missing, fused.heard, priors_of)
-
-
-def _verdict_on(judgement: m.Judgement, stamp_ns: int) -> m.Verdict:
-    robot = judgement.first.robot
-    return m.Verdict(stamp_ns=stamp_ns, robot=robot, judgement=judgement, by="log", reason="")

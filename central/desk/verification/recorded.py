@@ -20,6 +20,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import WireError
 
+M = TypeVar("M", bound=m.Message)
 T = TypeVar("T")
 Identity = tuple[object, ...]
 """Message key and names of its inputs."""
@@ -30,10 +31,7 @@ class RerunError(ValueError):
 
 
 class RecordedMeasurements(Mapping[int, m.Measurement]):
-    """Measurements of one incarnation by number.
-
-    contradicted: numbers with two different contents; the first one counts.
-    """
+    """Measurements of one incarnation by number; of a contradicted number the first."""
 
     def __init__(self) -> None:
         self._messages: dict[int, m.Measurement] = {}
@@ -82,7 +80,6 @@ class RecordedOutput:
     """Recorded message that can be recomputed, as sample and decoded."""
 
     sample: Sample
-    channel: ch.Channel
     message: m.Message
 
 
@@ -90,25 +87,22 @@ class RecordedOutput:
 class Recorded:
     """All node inputs and outputs in a log; each measurement once.
 
-    configured: last announcement of each node. outputs: recomputable messages in log order.
-    reported: consumed by the robot's report. published: announced by the source. known_map: prior
-    map for localisation. saved_maps: by author. withdrawals: first order on each robot. unsound:
-    number of invalid samples.
+    configured: last announcement of each node. outputs: recomputable messages by channel, in log
+    order. reported: consumed by the robot's report. published: announced by the source.
+    withdrawals: first order on each robot.
     """
 
     measurements: dict[Stream, RecordedMeasurements] = field(
         default_factory=partial(defaultdict, RecordedMeasurements)
     )
     configured: dict[str, m.Configuration] = field(default_factory=dict)
-    outputs: list[RecordedOutput] = field(default_factory=list)
+    outputs: dict[str, list[RecordedOutput]] = field(default_factory=partial(defaultdict, list))
     reported: dict[Stream, int] = field(default_factory=dict)
     published: dict[Stream, int] = field(default_factory=dict)
     known_map: m.KnownMap | None = None
     saved_maps: dict[str, m.SavedMap] = field(default_factory=dict)
     withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
     unsound: int = 0
-    _indexed: int = 0
-    _by_channel: dict[str, list[RecordedOutput]] = field(default_factory=dict)
 
     def take_all(self, samples: Sequence[Sample]) -> None:
         """Index samples in log order."""
@@ -141,30 +135,25 @@ class Recorded:
             case m.Withdrawal():
                 self.withdrawals.setdefault(message.robot, message)
             case m.StreamHead():
-                self._count(message)
+                stream = (message.robot, message.incarnation)
+                self.published[stream] = max(self.published.get(stream, 0), message.measurements)
             case m.End():
                 self.published |= {
                     (s.robot, s.incarnation): s.measurements for s in message.streams
                 }
             case _ if channel.recomputable:
-                self.outputs.append(RecordedOutput(sample, channel, message))
+                self.outputs[channel.name].append(RecordedOutput(sample, message))
             case _:
                 pass
 
-    def _count(self, head: m.StreamHead) -> None:
-        stream = (head.robot, head.incarnation)
-        self.published[stream] = max(self.published.get(stream, 0), head.measurements)
-
-    def of(self, channel: ch.Channel) -> list[m.Message]:
-        """Recorded messages of a channel, in log order."""
-        return [each.message for each in self.outputs_of(channel)]
+    def of(self, kind: type[M], *channels: ch.Channel) -> list[M]:
+        """Recorded messages of a kind by channel, each in log order."""
+        outputs = (each for channel in channels for each in self.outputs_of(channel))
+        return [each.message for each in outputs if isinstance(each.message, kind)]
 
     def outputs_of(self, channel: ch.Channel) -> Sequence[RecordedOutput]:
         """Recorded outputs on a channel, in log order."""
-        for each in self.outputs[self._indexed :]:
-            self._by_channel.setdefault(each.channel.name, []).append(each)
-        self._indexed = len(self.outputs)
-        return self._by_channel.get(channel.name, ())
+        return self.outputs.get(channel.name, ())
 
     @property
     def contradicted(self) -> list[m.Measurement]:
@@ -176,8 +165,8 @@ class Recorded:
     def robots(self) -> list[str]:
         """Robots with measurements or messages, by name."""
         names = {robot for robot, _ in self.measurements}
-        names |= {s.message.robot for s in self.outputs if isinstance(s.message, m.Submap | m.Done)}
-        return in_order(names)
+        names |= {each.robot for each in self.of(m.Submap, ch.SUBMAP)}
+        return in_order(names | {each.robot for each in self.of(m.Done, ch.ROBOT_DONE)})
 
     def incarnations(self, robot: str) -> list[int]:
         """A robot's incarnations with measurements, in order."""
@@ -186,45 +175,37 @@ class Recorded:
     def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
         """Recorded submaps by stream and sequence."""
         found: dict[Stream, dict[int, m.Submap]] = {}
-        for submap in self.of(ch.SUBMAP):
-            assert isinstance(submap, m.Submap)
+        for submap in self.of(m.Submap, ch.SUBMAP):
             found.setdefault((submap.robot, submap.incarnation), {})[submap.sequence] = submap
         return found
 
     def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
         """Inter-robot measurements by (robot, incarnation, sequence) of their submap."""
         found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
-        for sighting in self.of(ch.SIGHTING_FACTOR):
-            assert isinstance(sighting, m.SightingFactor)
+        for sighting in self.of(m.SightingFactor, ch.SIGHTING_FACTOR):
             name = (sighting.robot, sighting.incarnation, sighting.sequence)
             found.setdefault(name, []).append(sighting)
         return found
 
     def robot_config(self, robot: str) -> tuple[RobotConfig, bytes]:
         """Announced configuration of a robot, and its digest; raises RerunError."""
-        announced = self._announced(ch.robot_node(robot))
-        subject = f"the configuration of {robot}"
-        return _parsed(announced.configuration, RobotConfig, subject), announced.digest
+        return self._announced(ch.robot_node(robot), RobotConfig, f"the configuration of {robot}")
 
     def central_config(self) -> tuple[CentralConfig, bytes]:
         """Configuration of the centre and its digest; raises RerunError."""
-        announced = self._announced("central")
-        subject = "the centre's configuration"
-        return _parsed(announced.configuration, CentralConfig, subject), announced.digest
+        return self._announced("central", CentralConfig, "the centre's configuration")
 
-    def _announced(self, node: str) -> m.Configuration:
-        if node not in self.configured:
+    def _announced(self, node: str, kind: type[T], subject: str) -> tuple[T, bytes]:
+        announced = self.configured.get(node)
+        if announced is None:
             raise RerunError(
                 f"the log has no configuration of {node}: nothing of it can be computed"
             )
-        return self.configured[node]
-
-
-def _parsed(text: str, kind: type[T], subject: str) -> T:
-    try:
-        return msgspec.convert(with_current_names(msgspec.json.decode(text)), kind)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise RerunError(f"{subject} is not one of this version: {error}") from None
+        try:
+            text = with_current_names(msgspec.json.decode(announced.configuration))
+            return msgspec.convert(text, kind), announced.digest
+        except (msgspec.DecodeError, msgspec.ValidationError) as error:
+            raise RerunError(f"{subject} is not one of this version: {error}") from None
 
 
 _CONFIGURING = (ch.KNOWN_MAP, ch.ROBOT_CONFIG, ch.CENTRAL_CONFIG, ch.TEAM_CONFIG, ch.ROBOT_PROGRESS,

@@ -102,22 +102,21 @@ def recompute_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
 
 
 def _priors_named(log: Recorded, robot: str) -> PriorsNamed:
-    received = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
-    priors = {p.digest: p for p in received if isinstance(p, m.Prior) and p.robot == robot}
+    received = log.of(m.Prior, ch.PRIOR, ch.TEAM_PRIOR)
+    priors = {prior.digest: prior for prior in received if prior.robot == robot}
     used: dict[tuple[int, int], list[m.Prior | None]] = {}
-    for channel in (ch.TEAM_POSE, ch.OWN_POSE):
-        for pose in log.of(channel):
-            if not isinstance(pose, m.PoseEstimate) or pose.robot != robot:
-                continue
-            names = used.setdefault((pose.incarnation, pose.stamp_ns), [])
-            prior = priors.get(pose.map_digest)
-            if prior not in names if prior is not None else not names:
-                names.append(prior)
+    for pose in log.of(m.PoseEstimate, ch.TEAM_POSE, ch.OWN_POSE):
+        if pose.robot != robot:
+            continue
+        names = used.setdefault((pose.incarnation, pose.stamp_ns), [])
+        prior = priors.get(pose.map_digest)
+        if prior not in names if prior is not None else not names:
+            names.append(prior)
     return used
 
 
 def _withdrawn_at(log: Recorded, robot: str) -> WithdrawnAt:
-    own = (p for p in log.of(ch.TEAM_POSE) if isinstance(p, m.PoseEstimate) and p.robot == robot)
+    own = (pose for pose in log.of(m.PoseEstimate, ch.TEAM_POSE) if pose.robot == robot)
     return {(p.incarnation, p.stamp_ns) for p in own if not p.in_team_frame}
 
 
@@ -139,8 +138,8 @@ def _run_incarnations(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outg
 
 
 def _dones(log: Recorded, robot: str, incarnation: int) -> list[m.Done]:
-    messages = (d for d in log.of(ch.ROBOT_DONE) if isinstance(d, m.Done))
-    return [d for d in messages if (d.robot, d.incarnation) == (robot, incarnation)]
+    dones = log.of(m.Done, ch.ROBOT_DONE)
+    return [d for d in dones if (d.robot, d.incarnation) == (robot, incarnation)]
 
 
 def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
@@ -189,8 +188,7 @@ def _life(
 def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
     """Run a robot's node over an incarnation's measurements; return how many it consumed.
 
-    The centre is absent, so the robot waits for no map. Raises RerunError without its
-    configuration.
+    The centre is absent, so the robot waits for no map. Raises RerunError.
     """
     node = RecomputedRobot(*log.robot_config(robot), {}, **options)
     node.take_known_map(log)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -32,7 +32,7 @@ from teamslam.central.desk.verification.robot import recompute_robot
 from teamslam.team.recording.parts import OWN
 from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.reader import Log
-from teamslam.team.wire import arrays
+from teamslam.team.recording.tables import numbers_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import encoded
@@ -40,80 +40,46 @@ from teamslam.team.wire.codec import encoded
 RELATIVE = 1e-6
 ABSOLUTE = 1e-9
 """Elsewhere: |a − b| ≤ ABSOLUTE·s + RELATIVE·|b|, s the array's largest magnitude (at least 1)."""
-_IDS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
-    "ids": arrays.ids,
-    "stamps": arrays.stamps,
-    "nodes": arrays.stamps,
-    "counts": arrays.ids,
-    "rows": arrays.ids,
-    "landmarks": arrays.ids,
-    "seen": arrays.octets,
-}
-_FLOATS = (
-    "pose",
-    "poses",
-    "mean",
-    "means",
-    "covariance",
-    "covariances",
-    "classes",
-    "sensitivity",
-    "curvature",
-    "weights",
-    "start",
-    "start_covariance",
-    "crosses",
-    "point",
-)
-ARRAYS = frozenset({*_IDS, *_FLOATS})
-"""Fields compared number by number."""
+Field = tuple[str, str, str]
+"""Name of a differing field, and the recorded and the recomputed value as text."""
 
 
-@dataclass(frozen=True)
-class FieldDifference:
-    """First differing field, with both values as text."""
-
-    field: str
-    recorded: str
-    recomputed: str
+@cache
+def _arrays_of(kind: type[m.Message]) -> frozenset[str]:
+    """Fields that are compared number by number; digests state their length."""
+    hints = get_type_hints(kind, include_extras=True)
+    return frozenset(name for name, hint in hints.items() if hint is bytes)
 
 
-def first_difference(
-    recorded: m.Message, recomputed: m.Message, *, exact: bool
-) -> FieldDifference | None:
+def _first_difference(recorded: m.Message, recomputed: m.Message, *, exact: bool) -> Field | None:
     """Find the first differing field, within the tolerance unless `exact`."""
+    arrays = _arrays_of(type(recorded))
     for name in recorded.__struct_fields__:
         a, b = getattr(recorded, name), getattr(recomputed, name)
         if a == b:
             continue
-        if name in _IDS or name in _FLOATS:
-            found = _array_difference(name, _values(name, a), _values(name, b), exact=exact)
+        if name in arrays:
+            found = _array_difference(name, numbers_of(name, a), numbers_of(name, b), exact=exact)
             if found is not None:
                 return found
         elif exact or not _close(a, b):
-            return FieldDifference(name, _text(a), _text(b))
+            return name, _text(a), _text(b)
     return None
 
 
-def _values(name: str, data: bytes) -> NDArray[Any]:
-    return _IDS[name](data, name) if name in _IDS else arrays.floats(data, name)
-
-
-def _array_difference(
-    name: str, a: NDArray[Any], b: NDArray[Any], *, exact: bool
-) -> FieldDifference | None:
+def _array_difference(name: str, a: NDArray[Any], b: NDArray[Any], *, exact: bool) -> Field | None:
     if len(a) != len(b):
-        return FieldDifference(name, f"{len(a)} numbers", f"{len(b)} numbers")
-    tolerant = not exact and name in _FLOATS
-    scale = max(1.0, float(np.abs(b).max(initial=0.0))) if tolerant else 0.0
-    bits = f"u{a.itemsize}"
-    same = (
-        np.isclose(a, b, RELATIVE, ABSOLUTE * scale) if tolerant else a.view(bits) == b.view(bits)
-    )
+        return name, f"{len(a)} numbers", f"{len(b)} numbers"
+    if exact or a.dtype.kind != "f":
+        bits = f"u{a.itemsize}"
+        same = a.view(bits) == b.view(bits)
+    else:
+        scale = max(1.0, float(np.abs(b).max(initial=0.0)))
+        same = np.isclose(a, b, RELATIVE, ABSOLUTE * scale)
     if same.all():
         return None
     k = int(np.argmin(same))
-    return FieldDifference(f"{name}[{k}]", repr(a[k].item()), repr(b[k].item()))
+    return f"{name}[{k}]", repr(a[k].item()), repr(b[k].item())
 
 
 def _close(a: object, b: object) -> bool:
@@ -145,11 +111,11 @@ CHECKED = (
 """Channels in order of cause and effect."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Difference:
     """Recorded message that differs from the recomputed one.
 
-    counter: its publisher's. lacks: an input is missing from the log.
+    names: of its inputs. lacks: an input is missing from the log.
     """
 
     key: str
@@ -170,7 +136,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """One channel: number of messages, of bit-equal ones, and of those equal within tolerance.
+    """Counts of one channel's messages: of all, bit-equal, and equal within tolerance.
 
     first: first that differs, or else that lacks an input. lacking: messages that lack an input.
     """
@@ -221,7 +187,7 @@ Part = Callable[[], Mapping[Identity, m.Message]]
 def verify(log: Log, processes: int = 1) -> Verification:
     """Recompute a log and compare. Raises RerunError, LogError.
 
-    processes: most forked processes; with more than one this process may hold no lock in a thread.
+    processes: most forked processes; above 1 this process may hold no lock in a thread.
     """
     here = provenance()
     other = tuple(name for name in PLATFORM if log.metadata.get(name) != here[name])
@@ -250,7 +216,7 @@ def _compute_parts(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Id
     if processes == 1:
         yield from (part() for part in parts)
         return
-    pool = ProcessPoolExecutor(processes, get_context("fork"), _inherit, (parts,))
+    pool = ProcessPoolExecutor(processes, get_context("fork"), _inherited.extend, (parts,))
     try:
         # The centre, which is last, takes longest.
         begun = [pool.submit(_compute_part, number) for number in reversed(range(len(parts)))]
@@ -264,12 +230,8 @@ def _compute_parts(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Id
         pool.shutdown(cancel_futures=True)
 
 
-_inherited: Sequence[Part] = ()
-
-
-def _inherit(parts: Sequence[Part]) -> None:
-    global _inherited
-    _inherited = parts
+_inherited: list[Part] = []
+"""Parts of a forked process."""
 
 
 def _compute_part(number: int) -> Mapping[Identity, m.Message]:
@@ -298,9 +260,7 @@ def _compared(
         again = recomputed.get(identity(each.sample.key, each.message))
         if again is not None and encoded(again) == each.sample.payload:
             equal += 1
-            continue
-        difference = _difference(each, again, log, exact=exact)
-        if difference is None:
+        elif (difference := _difference(each, again, log, exact=exact)) is None:
             close += 1
         else:
             differences.append(difference)
@@ -312,53 +272,37 @@ def _compared(
 def _difference(
     output: RecordedOutput, recomputed: m.Message | None, log: Recorded, *, exact: bool
 ) -> Difference | None:
-    lacks = None if recomputed is not None else _lacking(output.message, log)
+    lacks = None
     if recomputed is None:
-        found = FieldDifference(
-            "the message", "there", "none" if lacks is None else f"{lacks}: none"
-        )
+        lacks = _lacking(output.message, log)
+        field: Field = ("the message", "there", "none" if lacks is None else f"{lacks}: none")
     else:
-        differs = first_difference(output.message, recomputed, exact=exact)
+        differs = _first_difference(output.message, recomputed, exact=exact)
         if differs is None and not exact:
             return None
-        found = differs or FieldDifference("the encoding", "another", "the program's")
-    sample = output.sample
-    return Difference(
-        key=sample.key,
-        stamp_ns=sample.stamp_ns,
-        counter=sample.counter,
-        names=_names(output.message),
-        field=found.field,
-        recorded=found.recorded,
-        recomputed=found.recomputed,
-        lacks=lacks is not None,
-    )
+        field = differs or ("the encoding", "another", "the program's")
+    sample, names = output.sample, _names(output.message)
+    where = sample.key, sample.stamp_ns, sample.counter
+    return Difference(*where, names, *field, lacks=lacks is not None)
 
 
 def _names(message: m.Message) -> str:
-    incarnation, sequence = (
-        getattr(message, "incarnation", None),
-        getattr(message, "sequence", None),
-    )
     if isinstance(message, m.FusedMap):
         return f"map {message.digest.hex()}"
+    sequence = getattr(message, "sequence", None)
     named = "" if sequence is None else f", sequence {sequence}"
-    return f"incarnation {incarnation}{named}"
+    return f"incarnation {getattr(message, 'incarnation', None)}{named}"
 
 
 def _lacking(message: m.Message, log: Recorded) -> str | None:
     match message:
         case m.PoseEstimate() if any(message.map_digest):
-            priors_of_all = (*log.of(ch.PRIOR), *log.of(ch.TEAM_PRIOR))
-            own = (p for p in priors_of_all if isinstance(p, m.Prior))
-            priors = {p.digest for p in own if p.robot == message.robot}
-            digest = message.map_digest
-            lost = None if digest in priors else f"no prior {digest.hex()} in the log"
-            return lost or _gap(log, message)
+            priors = log.of(m.Prior, ch.PRIOR, ch.TEAM_PRIOR)
+            if message.map_digest not in {p.digest for p in priors if p.robot == message.robot}:
+                return f"no prior {message.map_digest.hex()} in the log"
+            return _gap(log, message)
         case m.Prior() | m.Trajectory():
-            maps = [each for channel in MAPS for each in log.of(channel)]
-            by_digest = {each.digest: each for each in maps if isinstance(each, m.FusedMap)}
-            fused = by_digest.get(message.digest)
+            fused = {each.digest: each for each in log.of(m.FusedMap, *MAPS)}.get(message.digest)
             if fused is None:
                 return f"no map {message.digest.hex()} in the log"
             return _lacking(fused, log)  # its map lacks an input

@@ -11,8 +11,7 @@ import numpy as np
 from teamslam.central.desk.drawing import colour_of
 from teamslam.central.desk.evaluation.errors import PoseErrors, transform_points
 from teamslam.central.desk.evaluation.events import Event, EventDetector
-from teamslam.central.desk.evaluation.running import RunningErrors, TruthFrames
-from teamslam.central.desk.evaluation.truth_alignment import TruthAlignment
+from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment, TruthFrames
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.view import foxglove_scene as fox
 from teamslam.central.desk.view.drawn import (

@@ -24,9 +24,8 @@ import numpy as np
 
 from teamslam.central.desk.drawing import ROBOT_COLOURS
 from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
-from teamslam.central.desk.evaluation.running import RunningErrors
-from teamslam.central.desk.evaluation.truth_alignment import TruthAlignment
-from teamslam.central.desk.names import data_set_name
+from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment
+from teamslam.central.desk.names import data_set_of
 from teamslam.central.desk.view.drawn import (
     Landmarks,
     centre_particles,
@@ -57,12 +56,12 @@ _BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
 
 def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
     """Page title: data set, or scenario and seed; file."""
+    text = metadata.get("scenario", "{}")
+    if data_set := data_set_of(text):
+        return f"{data_set} · {name}"
     try:
-        of = json.loads(metadata.get("scenario", "{}"))
-        if data_set := data_set_name(str(of.get("world", {}).get("path", ""))):
-            return f"{data_set} · {name}"
-        scenario = str(of["name"])
-    except (ValueError, KeyError, TypeError, AttributeError):
+        scenario = str(json.loads(text)["name"])
+    except (ValueError, LookupError, TypeError):
         scenario = team
     seed = f", seed {metadata['seed']}" if "seed" in metadata else ""
     return f"{scenario}{seed} · {name}"

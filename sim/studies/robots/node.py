@@ -110,7 +110,7 @@ def comparison_robot(
 
 def in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
     """Recompute messages, waiting for recorded maps."""
-    fused = {f.exchange: f for f in log.of(ch.FUSED_MAP) if isinstance(f, m.FusedMap)}
+    fused = {each.exchange: each for each in log.of(m.FusedMap, ch.FUSED_MAP)}
     node = new()
     incarnations = log.incarnations(robot)
     inputs: list[m.Message] = [
@@ -118,7 +118,7 @@ def in_lockstep(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
         for incarnation in incarnations
         for counter in sorted(log.measurements[(robot, incarnation)])
     ]
-    if any(isinstance(d, m.Done) and d.robot == robot for d in log.of(ch.ROBOT_DONE)):
+    if any(each.robot == robot for each in log.of(m.Done, ch.ROBOT_DONE)):
         end = m.StreamEnd(
             robot=robot,
             incarnation=incarnations[-1],

@@ -69,7 +69,7 @@ class ComparisonCentre(CentralNode):
 
 def recorded_maps(log: "Recorded", fused: m.FusedMap) -> list[m.MapEstimate]:
     """The robots' own maps that a recorded map names."""
-    own = (x for x in log.of(ch.OWN_MAP) if isinstance(x, m.MapEstimate))
+    own = log.of(m.MapEstimate, ch.OWN_MAP)
     by_name = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
     names = ((x.robot, x.incarnation, x.sequence, fused.exchange) for x in fused.members)
     return [by_name[name] for name in names if name in by_name]
