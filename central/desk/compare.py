@@ -49,7 +49,7 @@ def _team_cells(run: Evaluation) -> dict[str, str]:
     fused, scenario = run.map, run.scenario
     shown = {c.heading: cells(run, [c])[0] for c in _MAP}
     if run.arbitrary_frame:
-        shown |= {c.heading: "–" for c in _MAP if c.path in _IN_THE_FRAME}
+        shown |= {c.heading: "–" for c in _MAP if c.of in _IN_THE_FRAME}
     broadcast = run.channels.get("central/map")
     return {
         "scenario": "–" if scenario is None else run.title,

@@ -354,8 +354,7 @@ def verify_ledger(
     from teamslam.central.desk.names import in_order
     from teamslam.central.desk.report.tables import (
         disposition_sheet,
-        outlier_sheet,
-        rejected_sheet,
+        rejection_sheets,
         terminal_table,
     )
     from teamslam.central.desk.verification.recorded import RerunError, index_log
@@ -372,7 +371,7 @@ def verify_ledger(
     used = sum(1 for maps in found.maps.values() if maps)
     console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
     if lists:
-        for listed in (rejected_sheet(found), outlier_sheet(found)):
+        for listed in rejection_sheets(found):
             if listed.rows:
                 console.print(terminal_table(listed))
     elif found.rejected or found.outliers:

@@ -1,9 +1,10 @@
 """Tables of a run, for terminal and page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import degrees
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich import box
@@ -25,9 +26,15 @@ from teamslam.team.wire import messages as m
 ABSURD_NEES = 1000
 """NEES per degree of freedom above which words replace it."""
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
-_COUNT_AGAIN = ("kalman", "kalman-per-axis")
+DEGREES = degrees(1.0)
 LEFT = ("robot", "disposition", "channel", "kind", "landmarks", "reason")
 """Headings of text columns."""
+CHANGES = ("moved", "gone", "new", "unchanged")
+"""States of landmarks against saved maps, as listed."""
+LISTED = 5
+"""Most landmarks of one state in a line of text, and most robots named below a table."""
+DECISIONS = 200
+"""Most decisions in the table; report.json has all."""
 Rows = Sequence[tuple[str, str]]
 
 
@@ -40,33 +47,37 @@ class Sheet(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Column of figures: heading, path of attributes, format, factor to the shown unit."""
+    """Column: heading, path of attributes or function, format, factor to the shown unit."""
 
     heading: str
-    path: str
-    form: str
+    of: str | Callable[[Any], float | str | None]
+    form: str = ""
     factor: float = 1
     unit: str = ""
-
-
-DEGREES = degrees(1.0)
 
 
 def format_figure(value: float | str | None, form: str, unit: str = "", factor: float = 1) -> str:
     """Format a number with its unit; a dash for None."""
     if value is None or isinstance(value, str):
-        return value or "–"
+        return "–" if value is None else value
     return f"{factor * value:{form}}{unit}"
 
 
 def cells(of: object, columns: Sequence[Column]) -> tuple[str, ...]:
     """Format figures of an object in these columns."""
-    return tuple(format_figure(figure(of, c.path), c.form, c.unit, c.factor) for c in columns)
+    return tuple(
+        format_figure(
+            figure(of, c.of) if isinstance(c.of, str) else c.of(of), c.form, c.unit, c.factor
+        )
+        for c in columns
+    )
 
 
-def headings(first: str, columns: Sequence[Column]) -> tuple[str, ...]:
-    """Headings of these columns, behind a first one."""
-    return (first, *(column.heading for column in columns))
+def _sheet(
+    first: str, columns: Sequence[Column], rows: Iterable[tuple[str, object]], note: str = ""
+) -> Sheet:
+    headings = (first, *(column.heading for column in columns))
+    return Sheet(headings, [(name, *cells(of, columns)) for name, of in rows], note)
 
 
 def comparable(evaluation: Evaluation, robot: RobotResult) -> RobotResult:
@@ -101,33 +112,7 @@ def terminal_table(sheet: Sheet) -> Table:
     return table
 
 
-_PEER = (
-    Column("set", "submaps", ""),
-    Column("at [s]", "complete_at_s", ".1f"),
-    Column("sent [B]", "uplink_bytes", ",.0f"),
-    Column("received [B]", "downlink_bytes", ",.0f"),
-)
-PEER_NOTE = (
-    "set: submaps of all robots; at: wall time of the final map; sent, received: bytes of "
-    "the set's channels; star: those of its own submaps, as a centre would get them; over: members "
-    "that came from each teammate, its own and those that it forwarded"
-)
-
-
-def peer_sheet(evaluation: Evaluation) -> Sheet:
-    """Each robot's final map, part of the set, and traffic."""
-    rows = []
-    for name, peer in evaluation.peers.items():
-        star = format_figure(figure(evaluation.robots.get(name), "uplink_bytes"), ",.0f")
-        over = (
-            f"{node.removeprefix('robot/')} {members}"
-            for node, members in peer.over.items()
-            if node.startswith("robot/") and node != f"robot/{name}"
-        )
-        sha256 = (peer.final_map_sha256 or "none")[:12]
-        rows.append((name, sha256, *cells(peer, _PEER), star, ", ".join(over)))
-    first, *rest = headings("robot", _PEER)
-    return Sheet((first, "final map", *rest, "star", "over"), rows, PEER_NOTE)
+# The team's rows.
 
 
 def title_of(evaluation: Evaluation) -> str:
@@ -140,42 +125,25 @@ def team_rows(evaluation: Evaluation) -> Rows:
     fused = evaluation.map
     if fused is None:
         return [("final map", "none: the run did not finish")]
-    errors, arbitrary = fused.errors, evaluation.arbitrary_frame
-    states = state_rows(evaluation)
     if not len(fused.ids) and fused.reasons:
-        return [("final map", f"empty: {'; '.join(fused.reasons)}"), *states]
+        return [("final map", f"empty: {'; '.join(fused.reasons)}"), *_state_rows(evaluation)]
     gone = sum(each.state == "gone" and each.landmark in fused.ids for each in fused.changes)
     of_them = f", {gone} of them gone" if gone else ""
-    rows = [("landmarks", f"{len(fused.ids)} in the final map{of_them}"), *states]
-    if errors is None:
-        rows.append(("landmark errors", f"can not be computed: {_without_truth(evaluation)}"))
-    else:
-        by = "" if fused.matching is None else f", {fused.matching.by}"
-        rows += [] if fused.matching is None else [("landmark errors", f"by {fused.matching}")]
-        rows += [
-            ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m{by}"),
-            ("after rigid alignment", format_figure(errors.aligned_rmse_m, ".3f", " m")),
-        ]
-        if not arbitrary:
-            absurd = errors.nees_per_dof > ABSURD_NEES
-            nees = _absurd(evaluation) if absurd else describe_nees(errors, joint=fused.joint)
-            rows.append(("map NEES per dof", nees))
-        shape = errors.shape
-        if shape is not None:
-            nees = f"{shape.nees_per_landmark / 2.0:.2f}; {100 * shape.coverage:.0f} % within 95 %"
-            rows.append(("shape NEES per dof", nees))
-        if not arbitrary:
-            rows.append(
-                ("landmarks within 95 %", f"{100 * errors.coverage:.0f} %, as the map lies")
-            )
-    rows.append(("joint cost per dof", format_figure(fused.cost_per_dof, ".3f")))
-    rows.append(("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")))
-    rows += _association_rows(evaluation)
-    rows += [("changes", change_words(fused.changes))] if fused.changes else []
+    rows = [
+        ("landmarks", f"{len(fused.ids)} in the final map{of_them}"),
+        *_state_rows(evaluation),
+        *_error_rows(evaluation, fused.errors),
+        ("joint cost per dof", format_figure(fused.cost_per_dof, ".3f")),
+        ("covariance scale", format_figure(fused.covariance_scale, ".2f", ", 1 is right")),
+    ]
+    if evaluation.gps_median_m is not None:
+        rows.append(("distance from GPS", f"{evaluation.gps_median_m:.2f} m, median of the paths"))
+    rows += [] if evaluation.association is None else _association_rows(evaluation.association)
+    rows += [("changes", _describe_changes(fused.changes))] if fused.changes else []
     rows += [("joined", short(words)) for words in fused.joined]
-    if evaluation.diagnosis:
-        rows += [("cause of misfit", describe(each)) for each in evaluation.diagnosis]
-    elif evaluation.scenario is not None and evaluation.scenario.fusion == "join":
+    rows += [("cause of misfit", describe(each)) for each in evaluation.diagnosis]
+    joins = evaluation.scenario is not None and evaluation.scenario.fusion == "join"
+    if joins and not evaluation.diagnosis:
         rows.append(("cause of misfit", "none found"))
     rows += [("note", words) for words in fused.reasons if not any(not_joined([words]))]
     rows += [("note", words) for words in evaluation.separate_times]
@@ -184,42 +152,62 @@ def team_rows(evaluation: Evaluation) -> Rows:
     if meetings:
         rows.append(("rendezvous", f"{sum(meetings)} times a robot sent what it held or was to"))
     rows.append(("final map, its set", f"{fused.digest}, frame {fused.frame or '–'}"))
-    if evaluation.unsound:
-        rows.append(("unsound messages", str(evaluation.unsound)))
+    return rows + ([("unsound messages", str(evaluation.unsound))] if evaluation.unsound else [])
+
+
+def _error_rows(evaluation: Evaluation, errors: MapErrors | None) -> Rows:
+    assert evaluation.map is not None
+    matching, arbitrary = evaluation.map.matching, evaluation.arbitrary_frame
+    if errors is None:
+        why = "no true landmark can be matched to one of the map's"
+        why = why if len(evaluation.true_landmarks) else "no true landmarks"
+        why = why if matching is None else str(matching)
+        return [("landmark errors", f"can not be computed: {why}")]
+    by = "" if matching is None else f", {matching.by}"
+    rows = [] if matching is None else [("landmark errors", f"by {matching}")]
+    rows += [
+        ("landmark RMSE", ARBITRARY if arbitrary else f"{errors.rmse_m:.3f} m{by}"),
+        ("after rigid alignment", format_figure(errors.aligned_rmse_m, ".3f", " m")),
+    ]
+    if not arbitrary:
+        rows.append(("map NEES per dof", _describe_nees(evaluation, errors)))
+    if (shape := errors.shape) is not None:
+        nees = f"{shape.nees_per_landmark / 2.0:.2f}; {100 * shape.coverage:.0f} % within 95 %"
+        rows.append(("shape NEES per dof", nees))
+    if not arbitrary:
+        rows.append(("landmarks within 95 %", f"{100 * errors.coverage:.0f} %, as the map lies"))
     return rows
 
 
-def _without_truth(evaluation: Evaluation) -> str:
-    if evaluation.map is not None and evaluation.map.matching is not None:
-        return str(evaluation.map.matching)
-    if not len(evaluation.true_landmarks):
-        return "no true landmarks"
-    return "no true landmark can be matched to one of the map's"
+def _describe_nees(evaluation: Evaluation, errors: MapErrors) -> str:
+    """Describe the map NEES and whether chance explains it."""
+    if errors.nees_per_dof > ABSURD_NEES:
+        again = figure(evaluation, "scenario.fusion") in ("kalman", "kalman-per-axis")
+        why = " (measurements counted again)" if again else ""
+        return f"> {ABSURD_NEES}: over-confident{why}"
+    kind = "joint" if figure(evaluation, "map.joint") else "blocks only"
+    nees, band = f"{errors.nees_per_dof:.4g}", f"95 % of {errors.band_text} ({kind})"
+    if errors.in_band:
+        return f"{nees}, in {band}"
+    if errors.nees_per_dof < errors.band[0]:
+        return f"{nees}, below {band}: the covariance is too large"
+    return (
+        f"{nees}, above {band}. WARNING: the errors are larger than the covariance says; by chance "
+        "that happens in one run of 40"
+    )
 
 
-def state_rows(evaluation: Evaluation) -> Rows:
-    """State of every robot in the final map."""
+def _state_rows(evaluation: Evaluation) -> Rows:
     states = evaluation.states
-    joined = [
-        name for name, of in states.items() if of.state == "joined" and not name.startswith(MAP)
-    ]
+    joined = [n for n, of in states.items() if of.state == "joined" and not n.startswith(MAP)]
     rows = [("robots in the map", ", ".join(joined) or "none")] if states else []
     if any(of.state == "alone" for of in states.values()):
         rows = [("robots, each by itself", ", ".join(states))]
-    return rows + [
-        (of.state, f"{name}: {of.why}")
-        for name, of in states.items()
-        if of.state not in {"joined", "alone"}
-    ]
+    apart = ((n, of) for n, of in states.items() if of.state not in {"joined", "alone"})
+    return rows + [(of.state, f"{name}: {of.why}") for name, of in apart]
 
 
-CHANGES = ("moved", "gone", "new", "unchanged")
-"""The states of landmarks against saved maps, as listed."""
-LISTED = 5
-"""Most landmarks of one state in a line of text."""
-
-
-def change_words(changes: Sequence[m.LandmarkChange]) -> str:
+def _describe_changes(changes: Sequence[m.LandmarkChange]) -> str:
     """Summarise changes since the saved maps, such as `1 moved (7: +0.50, -0.25 ± 0.02 m)`."""
     parts = []
     for state in CHANGES:
@@ -238,112 +226,69 @@ def change_words(changes: Sequence[m.LandmarkChange]) -> str:
     return ", ".join(parts)
 
 
-def change_sheet(changes: Sequence[m.LandmarkChange]) -> Sheet:
-    """Landmarks that have changed since the saved maps."""
+def _association_rows(found: AssociationResult) -> Rows:
+    precision, recall, f1, wrong = cells(found.pairs, _SCORE_IN_WORDS)
     rows = [
-        (str(each.landmark), each.state)
-        + (
-            (f"{each.dx:+.3f}", f"{each.dy:+.3f}", f"{each.sigma:.3f}", f"{each.chi2:.1f}", "")
-            if each.state == "moved"
-            else ("", "", "", "", f"{each.expected:.1f}" if each.state == "gone" else "")
-        )
-        for state in CHANGES[:-1]
-        for each in changes
-        if each.state == state
-    ]
-    note = (
-        "moved: a landmark that has not moved is listed with a probability of 0.001 (χ² of two "
-        "degrees of freedom). gone: it would have been missed by chance with less than that."
-    )
-    headings = ("landmark", "state", "dx [m]", "dy [m]", "σ [m]", "χ²", "expected sightings")
-    return Sheet(headings, rows, note)
-
-
-def describe_nees(errors: MapErrors, *, joint: bool) -> str:
-    """Describe the map NEES and whether chance explains it; joint: of the joint covariance."""
-    kind = "joint" if joint else "blocks only"
-    band = f"95 % of {errors.band_text} ({kind})"
-    if errors.in_band:
-        return f"{errors.nees_per_dof:.4g}, in {band}"
-    if errors.nees_per_dof < errors.band[0]:
-        return f"{errors.nees_per_dof:.4g}, below {band}: the covariance is too large"
-    return (
-        f"{errors.nees_per_dof:.4g}, above {band}. WARNING: the errors are larger than the "
-        "covariance says; by chance that happens in one run of 40"
-    )
-
-
-def _association_rows(evaluation: Evaluation) -> Rows:
-    found, gps_m = evaluation.association, evaluation.gps_median_m
-    rows = [] if gps_m is None else [("distance from GPS", f"{gps_m:.2f} m, median of the paths")]
-    if found is None:
-        return rows
-    pairs = found.pairs
-    recall, f1 = (format_figure(each, ".3f") for each in (pairs.recall, pairs.f1))
-    precision = format_figure(pairs.precision, ".4f")
-    wrong = format_figure(pairs.wrong_percent, ".3f", " %")
-    scores = (
-        f"precision {precision}, recall {recall}, F1 {f1}; {wrong} of the detections are in a "
-        "wrong landmark"
-    )
-    many = found.merges_right + found.merges_wrong + found.merges_refused > 0
-    merges = (
-        f"{found.merges_right} right, {found.merges_wrong} wrong; {found.merges_refused} attempts "
-        "wait"
-    )
-    return [
-        *rows,
-        ("association", scores),
+        (
+            "association",
+            f"precision {precision}, recall {recall}, F1 {f1}; {wrong} of the detections are in a "
+            "wrong landmark",
+        ),
         (
             "duplicates",
             f"{found.duplicates} of the {found.landmarks} landmarks that all submaps have, with "
             f"those left out of the map; {found.duplicates_confirmed} are of two submaps or more, "
             f"and the map shows {found.duplicates_shown}",
         ),
-        *([("pairs of robots merged", merges)] if many else []),
     ]
+    if found.merges_right + found.merges_wrong + found.merges_refused:
+        merges = (
+            f"{found.merges_right} right, {found.merges_wrong} wrong; {found.merges_refused} "
+            "attempts wait"
+        )
+        rows.append(("pairs of robots merged", merges))
+    return rows
 
 
-def _absurd(evaluation: Evaluation) -> str:
-    scenario = evaluation.scenario
-    again = scenario is not None and scenario.fusion in _COUNT_AGAIN
-    why = " (measurements counted again)" if again else ""
-    return f"> {ABSURD_NEES}: over-confident{why}"
+_SCORE_IN_WORDS = (
+    Column("", "precision", ".4f"),
+    Column("", "recall", ".3f"),
+    Column("", "f1", ".3f"),
+    Column("", "wrong_percent", ".3f", unit=" %"),
+)
+
+# The robots' sheets.
+
+_PEER = (
+    Column("final map", lambda peer: (peer.final_map_sha256 or "none")[:12]),
+    Column("set", "submaps"),
+    Column("at [s]", "complete_at_s", ".1f"),
+    Column("sent [B]", "uplink_bytes", ",.0f"),
+    Column("received [B]", "downlink_bytes", ",.0f"),
+)
+PEER_NOTE = (
+    "set: submaps of all robots; at: wall time of the final map; sent, received: bytes of "
+    "the set's channels; star: those of its own submaps, as a centre would get them; over: members "
+    "that came from each teammate, its own and those that it forwarded"
+)
 
 
-def _robot_note(evaluation: Evaluation) -> str:
-    online = [r for r in evaluation.robots.values() if r.smoothed is None and r.online is not None]
-    star = ", * of online ones" if online else ""
-    frame = "; positions as aligned with the map" if evaluation.arbitrary_frame else ""
-    words = (
-        "a step is one odometry interval; measurements are odometry intervals, scans and "
-        f"inter-robot measurements; errors of smoothed poses{star}{frame}"
-    )
-    left_out = [
-        f"{name}: {robot.consumption.not_used}"
-        for name, robot in evaluation.robots.items()
-        if robot.consumption.not_used
-    ]
-    more = f"; … and {len(left_out) - NOTED} robots more" if len(left_out) > NOTED else ""
-    return (
-        words
-        + "".join(f"; {each}" for each in left_out[:NOTED])
-        + more
-        + _describe_gated(evaluation)
-    )
+def peer_sheet(evaluation: Evaluation) -> Sheet:
+    """Each robot's final map, part of the set, and traffic."""
+    headings, rows, note = _sheet("robot", _PEER, evaluation.peers.items(), PEER_NOTE)
+    more = []
+    for name, peer in evaluation.peers.items():
+        over = (
+            f"{node.removeprefix('robot/')} {members}"
+            for node, members in peer.over.items()
+            if node.startswith("robot/") and node != f"robot/{name}"
+        )
+        star = format_figure(figure(evaluation.robots.get(name), "uplink_bytes"), ",.0f")
+        more.append((star, ", ".join(over)))
+    whole = [(*row, *last) for row, last in zip(rows, more, strict=True)]
+    return Sheet((*headings, "star", "over"), whole, note)
 
 
-def _describe_gated(evaluation: Evaluation) -> str:
-    counts = {name: robot.consumption.gated for name, robot in evaluation.robots.items()}
-    most = sorted(filter(counts.get, counts), key=lambda name: -counts[name])
-    listed = ", ".join(f"{name} {counts[name]:,}" for name in most[:NOTED])
-    more = ", …" * (len(most) > NOTED)
-    total = sum(counts.values())
-    return f"; detections rejected as outliers: {f'{listed}{more}' if total else 'none'}"
-
-
-NOTED = 5
-"""Most robots named below the table."""
 ROBOT_HEADINGS = (
     "robot", "steps", "measure-\nments\nused", "sub-\nmaps", "position\nRMSE [m]",
     "heading\nRMSE [°]", "pose\nNEES/dof", "uplink\nB/step",
@@ -373,12 +318,38 @@ def robot_sheet(evaluation: Evaluation) -> Sheet:
     return Sheet(ROBOT_HEADINGS, rows, _robot_note(evaluation))
 
 
+def _robot_note(evaluation: Evaluation) -> str:
+    robots = evaluation.robots
+    online = any(r.smoothed is None and r.online is not None for r in robots.values())
+    left_out = [
+        f"{n}: {r.consumption.not_used}" for n, r in robots.items() if r.consumption.not_used
+    ]
+    gated = {name: robot.consumption.gated for name, robot in robots.items()}
+    most = sorted(filter(gated.get, gated), key=lambda name: -gated[name])
+    listed = ", ".join(f"{name} {gated[name]:,}" for name in most[:LISTED])
+    listed += ", …" * (len(most) > LISTED)
+    parts = [
+        "a step is one odometry interval; measurements are odometry intervals, scans and "
+        "inter-robot measurements",
+        f"errors of smoothed poses{', * of online ones' if online else ''}",
+        *["positions as aligned with the map"] * evaluation.arbitrary_frame,
+        *left_out[:LISTED],
+        *[f"… and {len(left_out) - LISTED} robots more"] * (len(left_out) > LISTED),
+        f"detections rejected as outliers: {listed or 'none'}",
+    ]
+    return "; ".join(parts)
+
+
 _PATH = (
     Column("path\n[m]", "smoothed.position_rmse_m", ".3f"),
     Column("aligned\n[m]", "aligned_rmse_m", ".3f"),
     Column("NEES\n/dof", "smoothed.nees_per_dof", ".3g"),
     Column("in\n95 %", "smoothed.coverage", ".0%"),
-    Column("online\n[m]", "online.position_rmse_m", ".3f"),
+    Column(
+        "online\n[m]",
+        lambda r: OUTSIDE if r.outside else figure(r, "online.position_rmse_m"),
+        ".3f",
+    ),
     Column("aligned\n[m]", "online_aligned_rmse_m", ".3f"),
     Column("NEES\n/dof", "online.nees_per_dof", ".3g"),
     Column("in\n95 %", "online.coverage", ".0%"),
@@ -391,23 +362,18 @@ PATH_NOTE = (
 
 def path_sheet(evaluation: Evaluation) -> Sheet:
     """Errors, NEES and coverage of paths."""
-    rows = []
-    for name, robot in evaluation.robots.items():
-        row = [name, *cells(comparable(evaluation, robot), _PATH)]
-        row[5] = OUTSIDE if robot.outside else row[5]
-        rows.append(row)
-    return Sheet(headings("robot", _PATH), rows, PATH_NOTE)
+    rows = ((name, comparable(evaluation, robot)) for name, robot in evaluation.robots.items())
+    return _sheet("robot", _PATH, rows, PATH_NOTE)
 
 
 _OWN = (
-    Column("land-\nmarks", "own_map.count", ""),
+    Column("land-\nmarks", "own_map.count"),
     Column("RMSE\n[m]", "own_map.rmse_m", ".3f"),
     Column("aligned\n[m]", "own_map.aligned_rmse_m", ".3f"),
     Column("NEES\n/dof", "own_map.nees_per_dof", ".4g"),
-    Column("95 % of it", "own_map.band_text", ""),
+    Column("95 % of it", "own_map.band_text"),
     Column("in\n95 %", "own_map.coverage", ".0%"),
 )
-OWN_NOTE = "each robot's own last map; aligned: moved rigidly onto the truth"
 
 
 def is_unfused(evaluation: Evaluation) -> bool:
@@ -418,8 +384,98 @@ def is_unfused(evaluation: Evaluation) -> bool:
 
 def own_sheet(evaluation: Evaluation) -> Sheet:
     """Errors, NEES and coverage of every robot's own map."""
-    rows = [(name, *cells(robot, _OWN)) for name, robot in evaluation.robots.items()]
-    return Sheet(headings("robot", _OWN), rows, OWN_NOTE)
+    note = "each robot's own last map; aligned: moved rigidly onto the truth"
+    return _sheet("robot", _OWN, evaluation.robots.items(), note)
+
+
+_CONSISTENCY = (
+    Column("NIS\n/dof", "innovations.per_dof", ".3f"),
+    Column("its\ndof", "innovations.total_dof", ","),
+    Column("joint cost\n/dof", "cost", ".3f"),
+    Column("covariance\nscale", "scale", ".2f"),
+    Column(
+        "online\nNEES/dof",
+        lambda of: (
+            OUTSIDE if figure(of, "robot.outside") else figure(of, "robot.online.nees_per_dof")
+        ),
+        ".3g",
+    ),
+    Column("in\n95 %", "robot.online.coverage", ".0%"),
+)
+NIS_NOTE = (
+    "NIS lies below 1 where a robot's sensor is configured with errors that last within a window "
+    "(range_white, bearing_white): the particles take every error for a new one."
+)
+
+
+def consistency_sheet(run: Run) -> Sheet:
+    """Consistency: NEES and coverage with truth, else NIS and cost."""
+    of, innovations = run.evaluation, run.history.innovations
+    rows = []
+    for name in in_order(of.robots.keys() | innovations.keys() | of.cost_by_robot.keys()):
+        robot = of.robots.get(name)
+        row = SimpleNamespace(
+            innovations=innovations.get(name),
+            cost=of.cost_by_robot.get(name),
+            scale=of.scale_by_robot.get(name),
+            robot=robot and comparable(of, robot),
+        )
+        rows.append((name, row))
+    whole = _sheet("robot", _CONSISTENCY, rows, NIS_NOTE)
+    return whole._replace(rows=[row for row in whole.rows if {*row[1:]} != {"–"}])
+
+
+_APE = (
+    Column("path", "kind"),
+    Column("poses", "of.poses", ","),
+    Column("APE\n[m]", "of.ape_m", ".3f"),
+    Column("APE by\nitself [m]", "of.ape_aligned_m", ".3f"),
+    Column("APE by\nitself [°]", "of.ape_aligned_rad", ".2f", DEGREES),
+    Column("RPE\n[m]", "of.rpe_m", ".3f"),
+    Column("RPE\n[°]", "of.rpe_rad", ".2f", DEGREES),
+)
+APE_NOTE = (
+    "RMS with evo's definitions; by itself: after the rigid motion that aligns this path, not the "
+    "map; RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
+    "`evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum` gives the same."
+)
+
+
+def ape_sheet(run: Run) -> Sheet:
+    """Absolute and relative errors of every path."""
+    unplaced: dict[str, Any] = {"ape_m": None} if run.evaluation.arbitrary_frame else {}
+    rows = (
+        (name, SimpleNamespace(kind=kind, of=replace(errors, **unplaced)))
+        for name, of in run.trajectories().items()
+        for kind, errors in of.items()
+    )
+    return _sheet("robot", _APE, rows, APE_NOTE)
+
+
+def _quantile_of(name: str, q: float) -> Callable[[Any], float]:
+    return lambda of: float(np.quantile(getattr(of, name), q))
+
+
+_LATENCY = (
+    Column("submaps", lambda of: len(of.last_s), ","),
+    *(
+        Column(f"{which}\n{name}", _quantile_of(f"{which}_s", q), ".3g")
+        for which in ("last", "first")
+        for name, q in (("median", 0.5), ("95 %", 0.95), ("max", 1.0))
+    ),
+)
+LATENCY_NOTE = (
+    "Wall time [s] from the publication of a submap's last and first measurement to that of "
+    "the first map that used it, by the publishers' clocks."
+)
+
+
+def latency_sheet(run: Run) -> Sheet:
+    """Median, 95 % quantile and maximum of each robot's latencies."""
+    return _sheet("robot", _LATENCY, run.history.latencies.items(), LATENCY_NOTE)
+
+
+# Measurements, landmarks, traffic, processes.
 
 
 def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
@@ -431,122 +487,70 @@ def disposition_sheet(ledgers: Mapping[str, Mapping[str, int]]) -> Sheet:
     return Sheet(("disposition", *ledgers, "all"), rows)
 
 
-def rejected_sheet(ledger: Ledger) -> Sheet:
-    """Each rejected measurement of a ledger with its reason."""
-    rows = [
-        (
-            short(named((each.robot, each.incarnation))),
-            str(each.number),
-            f"{each.stamp_s:.3f}",
-            each.kind,
-            " ".join((*map(str, each.landmarks), *each.teammates)),
-            each.reason,
-        )
-        for each in ledger.rejected
-    ]
-    return Sheet(("robot", "number", "stamp [s]", "kind", "landmarks", "reason"), rows)
-
-
-def outlier_sheet(ledger: Ledger) -> Sheet:
-    """Detections that windows rejected as outliers, by submap."""
-    rows = [
-        (
-            short(named((each.robot, each.incarnation))),
-            str(each.submap),
-            f"{each.start_s:.3f}",
-            f"{each.stamp_s:.3f}",
-            str(each.detections),
-        )
-        for each in ledger.outliers
-    ]
-    return Sheet(("robot", "submap", "from [s]", "to [s]", "outliers"), rows)
-
-
-NIS_NOTE = (
-    "NIS lies below 1 where a robot's sensor is configured with errors that last within a window "
-    "(range_white, bearing_white): the particles take every error for a new one."
+_REJECTED = (
+    Column("number", "number"),
+    Column("stamp [s]", "stamp_s", ".3f"),
+    Column("kind", "kind"),
+    Column("landmarks", lambda each: " ".join((*map(str, each.landmarks), *each.teammates))),
+    Column("reason", "reason"),
 )
-_NIS = (Column("NIS\n/dof", "per_dof", ".3f"), Column("its\ndof", "total_dof", ","))
-_ONLINE = (
-    Column("online\nNEES/dof", "online.nees_per_dof", ".3g"),
-    Column("in\n95 %", "online.coverage", ".0%"),
+_OUTLIERS = (
+    Column("submap", "submap"),
+    Column("from [s]", "start_s", ".3f"),
+    Column("to [s]", "stamp_s", ".3f"),
+    Column("outliers", "detections"),
 )
 
 
-def consistency_sheet(run: Run) -> Sheet:
-    """Consistency: NEES and coverage with truth, else NIS and cost."""
-    evaluation, innovations = run.evaluation, run.history.innovations
-    cost, scale = evaluation.cost_by_robot, evaluation.scale_by_robot
-    rows = []
-    for name in in_order(evaluation.robots.keys() | innovations.keys() | cost.keys()):
-        robot = evaluation.robots.get(name)
-        online = [*cells(robot and comparable(evaluation, robot), _ONLINE)]
-        online[0] = OUTSIDE if robot is not None and robot.outside else online[0]
-        of_map = format_figure(cost.get(name), ".3f"), format_figure(scale.get(name), ".2f")
-        rows.append((name, *cells(innovations.get(name), _NIS), *of_map, *online))
-    columns = headings("robot", _NIS)
-    of_map = "joint cost\n/dof", "covariance\nscale"
-    filled = [row for row in rows if any(cell != "–" for cell in row[1:])]
-    return Sheet((*columns, *of_map, *(each.heading for each in _ONLINE)), filled, NIS_NOTE)
+def rejection_sheets(ledger: Ledger) -> tuple[Sheet, Sheet]:
+    """Rejected measurements with reasons, and detections rejected as outliers, by submap."""
+    rejected, outliers = (
+        ((short(named((each.robot, each.incarnation))), each) for each in of)
+        for of in (ledger.rejected, ledger.outliers)
+    )
+    return _sheet("robot", _REJECTED, rejected), _sheet("robot", _OUTLIERS, outliers)
 
 
-_APE = (
-    Column("poses", "poses", ","),
-    Column("APE\n[m]", "ape_m", ".3f"),
-    Column("APE by\nitself [m]", "ape_aligned_m", ".3f"),
-    Column("APE by\nitself [°]", "ape_aligned_rad", ".2f", DEGREES),
-    Column("RPE\n[m]", "rpe_m", ".3f"),
-    Column("RPE\n[°]", "rpe_rad", ".2f", DEGREES),
+def _only_if(state: str, name: str) -> Callable[[Any], float | str]:
+    return lambda change: getattr(change, name) if change.state == state else ""
+
+
+_CHANGE = (
+    Column("state", "state"),
+    Column("dx [m]", _only_if("moved", "dx"), "+.3f"),
+    Column("dy [m]", _only_if("moved", "dy"), "+.3f"),
+    Column("σ [m]", _only_if("moved", "sigma"), ".3f"),
+    Column("χ²", _only_if("moved", "chi2"), ".1f"),
+    Column("expected sightings", _only_if("gone", "expected"), ".1f"),
 )
-APE_NOTE = (
-    "RMS with evo's definitions; by itself: after the rigid motion that aligns this path, not the "
-    "map; RPE: from pose to pose. The folder trajectories has the paths in TUM format: "
-    "`evo_ape tum r1.smoothed.truth.tum r1.smoothed.tum` gives the same."
+CHANGE_NOTE = (
+    "moved: a landmark that has not moved is listed with a probability of 0.001 (χ² of two "
+    "degrees of freedom). gone: it would have been missed by chance with less than that."
 )
 
 
-def ape_sheet(run: Run) -> Sheet:
-    """Absolute and relative errors of every path."""
-    rows = [
-        [name, kind, *cells(errors, _APE)]
-        for name, of in run.trajectories().items()
-        for kind, errors in of.items()
-    ]
-    for row in rows if run.evaluation.arbitrary_frame else ():
-        row[3] = "–"
-    return Sheet(("robot", *headings("path", _APE)), rows, APE_NOTE)
-
-
-LATENCY_NOTE = (
-    "Wall time [s] from the publication of a submap's last and first measurement to that of "
-    "the first map that used it, by the publishers' clocks."
-)
-
-
-def latency_sheet(run: Run) -> Sheet:
-    """Median, 95 % quantile and maximum of each robot's latencies."""
-    rows = [
-        (
-            name,
-            f"{len(of.last_s):,}",
-            *(f"{np.quantile(v, q):.3g}" for v in (of.last_s, of.first_s) for q in (0.5, 0.95, 1)),
-        )
-        for name, of in run.history.latencies.items()
-    ]
-    columns = (f"{of}\n{which}" for of in ("last", "first") for which in ("median", "95 %", "max"))
-    return Sheet(("robot", "submaps", *columns), rows, LATENCY_NOTE)
+def change_sheet(changes: Sequence[m.LandmarkChange]) -> Sheet:
+    """Landmarks that have changed since the saved maps."""
+    of = ((str(e.landmark), e) for state in CHANGES[:-1] for e in changes if e.state == state)
+    return _sheet("landmark", _CHANGE, of, CHANGE_NOTE)
 
 
 def traffic_sheet(run: Run) -> Sheet:
     """Messages, bytes and mean rate of every key."""
     span_s = (run.history.end_ns - run.history.start_ns) * 1e-9
-    rows = [
-        (key, f"{t.messages:,}", f"{t.bytes:,}", f"{t.bytes / span_s:,.1f}" if span_s > 0 else "–")
-        for key, t in run.evaluation.channels.items()
-    ]
-    return Sheet(("key", "messages", "bytes", "B/s"), rows)
+    columns = (
+        Column("messages", "messages", ","),
+        Column("bytes", "bytes", ","),
+        Column("B/s", lambda of: of.bytes / span_s if span_s > 0 else None, ",.1f"),
+    )
+    return _sheet("key", columns, run.evaluation.channels.items())
 
 
+_PROCESS = (
+    Column("CPU\n[s]", lambda took: took.get("cpu_s"), ".2f"),
+    Column("peak RSS\n[MB]", lambda took: took.get("peak_rss_mb"), ".0f"),
+    Column("PSS\n[MB]", lambda took: took.get("pss_mb"), ".0f"),
+)
 PSS_NOTE = (
     "RSS: resident memory, shared pages included. PSS at the end of the run: a page that n "
     "processes share counts 1/n in each."
@@ -555,15 +559,7 @@ PSS_NOTE = (
 
 def process_sheet(processes: Mapping[str, Mapping[str, float | None]]) -> Sheet:
     """Resources of each launched process."""
-    rows = [
-        (
-            name,
-            format_figure(took.get("cpu_s"), ".2f"),
-            *(format_figure(took.get(memory), ".0f") for memory in ("peak_rss_mb", "pss_mb")),
-        )
-        for name, took in processes.items()
-    ]
-    return Sheet(("process", "CPU\n[s]", "peak RSS\n[MB]", "PSS\n[MB]"), rows, PSS_NOTE)
+    return _sheet("process", _PROCESS, processes.items(), PSS_NOTE)
 
 
 _SCORE = (
@@ -584,38 +580,32 @@ def score_sheet(found: AssociationResult) -> Sheet:
         f"share landmarks: {found.merges_right} rightly, {found.merges_wrong} wrongly; "
         f"{found.merges_refused} attempts wait. Scored by labels that no node receives."
     )
-    rows = [
-        (name, *cells(of, _SCORE))
-        for name, of in (("inside windows", found.inside), ("over all", found.pairs))
-    ]
-    return Sheet(headings("pairs of detections", _SCORE), rows, note)
+    rows = (("inside windows", found.inside), ("over all", found.pairs))
+    return _sheet("pairs of detections", _SCORE, rows, note)
 
 
 _DECISION = (
     Column("at [s]", "stamp_ns", ".1f", 1e-9),
-    Column("pairs", "pairs", ""),
+    Column("pairs", "pairs"),
     Column("LLR", "llr", ".0f"),
-    Column("absent", "absent", ""),
-    Column("rival's\npairs", "rival_pairs", ""),
+    Column("absent", "absent"),
+    Column("rival's\npairs", "rival_pairs"),
     Column("rival's\nevidence", "rival_llr", ".0f"),
     Column("share", "share", ".2f"),
     Column("sd [m]", "sd", ".2f"),
+    Column("why", "why"),
 )
 DECISION_NOTE = (
     "LLR: log-likelihood ratio of the pairs; absent: landmarks that one side has where the other "
     "looked and has none, which speak against; share: of the landmarks there, matched ones. A "
     "decision that waits failed the named test; an undone one was reversed by a later one."
 )
-DECISIONS = 200
-"""Most decisions in the table; report.json has all."""
 
 
 def decision_sheet(decisions: Sequence[m.AssociationDecision]) -> Sheet:
     """Closures and merges: newest first, then pending ones."""
     made = [each for each in decisions if each.kind != "waits"]
     waits = [each for each in decisions if each.kind == "waits"]
-    rows = [
-        (f"{each.kind}: {each.about}", *cells(each, _DECISION), each.why)
-        for each in [*reversed(made), *waits][:DECISIONS]
-    ]
-    return Sheet((*headings("decision", _DECISION), "why"), rows, DECISION_NOTE)
+    shown = [*reversed(made), *waits][:DECISIONS]
+    rows = ((f"{each.kind}: {each.about}", each) for each in shown)
+    return _sheet("decision", _DECISION, rows, DECISION_NOTE)
