@@ -4,8 +4,10 @@ A landmark takes the majority label of its detections. A pair of detections with
 landmark is right, with one label in two landmarks missed, with two labels in one landmark wrong.
 """
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -96,12 +98,8 @@ def association_result(log: Collected) -> AssociationResult | None:
     known = label != UNKNOWN
     label_of, submaps = _majorities(label, places, identity)
     several = len({place[:3] for place in identity}) > 1
-    named = [label_of[number] for number in label_of if label_of[number] != UNKNOWN]
-    confirmed = [
-        number
-        for number in label_of
-        if label_of[number] != UNKNOWN and (len(submaps[number]) > 1 or not several)
-    ]
+    named = [number for number in label_of if label_of[number] != UNKNOWN]
+    confirmed = [number for number in named if len(submaps[number]) > 1 or not several]
     final = log.newest(ch.FINAL_MAP, m.FusedMap)
     decisions = () if final is None else final.decisions
     in_map = {*confirmed} if final is None else {*ids(final.ids, "ids").tolist()}
@@ -111,7 +109,7 @@ def association_result(log: Collected) -> AssociationResult | None:
         inside=_pairs(label[known], local[known], _numbered(windows)[known]),
         label_of=label_of,
         landmarks=len(label_of),
-        duplicates=len(named) - len(set(named)),
+        duplicates=_beyond_the_first(named, label_of),
         duplicates_confirmed=_beyond_the_first(confirmed, label_of),
         duplicates_shown=_beyond_the_first(in_map.intersection(confirmed), label_of),
         merges_right=right,
@@ -209,39 +207,32 @@ def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
 def _majorities(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[dict[int, int], dict[int, set[Place]]]:
-    votes: dict[int, dict[int, int]] = {}
+    votes: dict[int, Counter[int]] = {}
     submaps: dict[int, set[Place]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
-        number = None if place is None else identity.get(place)
-        if place is None or number is None:
+        if place is None or (number := identity.get(place)) is None:
             continue
-        of = votes.setdefault(number, {})
+        votes.setdefault(number, Counter()).update([own] * (own != UNKNOWN))
         submaps.setdefault(number, set()).add((*place[:3], 0))
-        if own != UNKNOWN:
-            of[own] = of.get(own, 0) + 1
-    chosen = {
-        number: max(sorted(of), key=of.__getitem__) if of else UNKNOWN
-        for number, of in votes.items()
-    }
-    return chosen, submaps
+    return {number: _most_voted(of) for number, of in votes.items()}, submaps
+
+
+def _most_voted(votes: Counter[int]) -> int:
+    return max(sorted(votes), key=votes.__getitem__, default=UNKNOWN)
 
 
 def _merges(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
 ) -> tuple[int, int]:
-    votes: dict[int, dict[str, dict[int, int]]] = {}
+    votes: dict[int, dict[str, Counter[int]]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
-        number = None if place is None else identity.get(place)
-        if place is None or number is None or own == UNKNOWN:
+        if place is None or (number := identity.get(place)) is None or own == UNKNOWN:
             continue
-        of = votes.setdefault(number, {}).setdefault(place[0], {})
-        of[own] = of.get(own, 0) + 1
+        votes.setdefault(number, {}).setdefault(place[0], Counter())[own] += 1
     agreed: dict[tuple[str, str], list[bool]] = {}
     for by_robot in votes.values():
-        best = {robot: max(sorted(of), key=of.__getitem__) for robot, of in by_robot.items()}
-        robots = sorted(best)
-        for i, a in enumerate(robots):
-            for b in robots[i + 1 :]:
-                agreed.setdefault((a, b), []).append(best[a] == best[b])
+        best = {robot: _most_voted(of) for robot, of in by_robot.items()}
+        for a, b in combinations(sorted(best), 2):
+            agreed.setdefault((a, b), []).append(best[a] == best[b])
     right = sum(2 * sum(each) >= len(each) for each in agreed.values())
     return right, len(agreed) - right

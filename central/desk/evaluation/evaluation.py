@@ -5,7 +5,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,7 +27,7 @@ from teamslam.central.desk.evaluation.errors import (
     transform_points,
 )
 from teamslam.central.desk.evaluation.log import Collected, collect_log
-from teamslam.central.desk.evaluation.matching import Gospa, Matching, gospa, half_spacing, nearest
+from teamslam.central.desk.evaluation.matching import Gospa, gospa, half_spacing, nearest
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
 from teamslam.central.desk.evaluation.robot import peer_results, robot_result
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
@@ -44,7 +43,7 @@ from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.check import holes
 from teamslam.team.recording.reader import Log
-from teamslam.team.shapes import Bool, Float, Int64, UInt32
+from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
@@ -87,16 +86,16 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
     robots = {}
     for robot in log.robots:
         uplink = _uplink_bytes(log, scenario, robot)
-        robots[robot] = robot_result(log, robot, uplink, own_map(log, robot, true), is_in_frame)
+        robots[robot] = robot_result(log, robot, uplink, _own_map(log, robot, true), is_in_frame)
     truth_from_map = _motion(robots.values()) if arbitrary else np.zeros(3)
     fused = None
     if message is not None:
-        fused = map_result(log, message, true, label_of, truth_from_map, arbitrary=arbitrary)
+        fused = _map_result(log, message, true, label_of, truth_from_map, arbitrary=arbitrary)
     motion = _team_motion(fused, robots.values())
     robots = {name: _aligned(robot, motion) for name, robot in robots.items()}
     end = log.newest(ch.END, m.End)
     faults = log.of_all(ch.FAULT, m.Fault)
-    streams = _streams(log)
+    mirrored, late, separate_times = _examine_streams(log)
     return Evaluation(
         scenario=scenario,
         map=fused,
@@ -110,9 +109,9 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
             *_set_aside(faults),
         ),
         unsound=log.unsound,
-        cost_by_robot=_by_robot(log, "joint_cost_per_dof."),
+        cost_by_robot=log.figures("central", "joint_cost_per_dof."),
         faults=len(faults),
-        scale_by_robot=_by_robot(log, "covariance_scale."),
+        scale_by_robot=log.figures("central", "covariance_scale."),
         arbitrary_frame=arbitrary,
         truth_from_map=None if motion is None else motion[0],
         peers=peer_results(log),
@@ -125,22 +124,17 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         verdicts=verdicts_given(log),
         data_set="" if world is None else data_set_of(world.configuration),
         gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
-        separate_times=streams.separate_times,
-        mirrored=streams.mirrored,
-        lateness=streams.lateness,
+        separate_times=separate_times,
+        mirrored=mirrored,
+        lateness=late,
         recorded_ns=log.first_ns,
     )
 
 
-class _Streams(NamedTuple):
-    """Findings in the measurements alone."""
-
-    mirrored: tuple[m.Diagnosis, ...]
-    lateness: Mapping[str, Late]
-    separate_times: tuple[str, ...]
-
-
-def _streams(log: Collected) -> _Streams:
+def _examine_streams(
+    log: Collected,
+) -> tuple[tuple[m.Diagnosis, ...], dict[str, Late], tuple[str, ...]]:
+    """Find mirrored robots, delays and separate times in the measurements alone."""
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
     configs = {robot: _config(log, robot) for robot, _ in log.timed}
@@ -153,7 +147,7 @@ def _streams(log: Collected) -> _Streams:
             spans[robot] = min(first, span[0]), max(last, span[1])
     of = [(robot, longest[robot], configs[robot]) for robot in in_order(longest)]
     offsets = ((robot, lateness(timed, config)) for robot, timed, config in of)
-    return _Streams(
+    return (
         tuple(filter(None, (mirrored_cause(*each) for each in of))),
         {robot: found for robot, found in offsets if found is not None},
         tuple(filter(None, (separate_times_warning(spans),))),
@@ -180,8 +174,7 @@ def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
 def _warn_of_missing(log: Collected) -> list[str]:
     warnings = []
     for robot in log.robots:
-        status = log.newest(ch.STATUS, m.Status, ch.source_node(robot))
-        figures = {} if status is None else status.figures
+        figures = log.figures(ch.source_node(robot))
         lost = figures.get("messages_lost", 0.0) + figures.get("messages_dropped", 0.0)
         if lost and math.isfinite(lost):
             warnings.append(
@@ -196,17 +189,11 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
     for fault in faults:
         by_node.setdefault(fault.node, []).append(fault)
     return [
-        f"{node} set {len(found)} messages aside; the first, {found[0].origin}, raised "
-        f"{found[0].error} at {found[0].place}: {found[0].text}"
-        for node, found in ((node, by_node[node]) for node in in_order(by_node))
+        f"{node} set {len(by_node[node])} messages aside; the first, {first.origin}, raised "
+        f"{first.error} at {first.place}: {first.text}"
+        for node in in_order(by_node)
+        for first in by_node[node][:1]
     ]
-
-
-def _by_robot(log: Collected, name: str) -> dict[str, float]:
-    status = log.newest(ch.STATUS, m.Status, "central")
-    if status is None:
-        return {}
-    return {k.removeprefix(name): v for k, v in status.figures.items() if k.startswith(name)}
 
 
 def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
@@ -216,7 +203,6 @@ def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
 
 
 def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | None:
-    """Bytes of the channels that the team's rule consumes; None for an invalid pair."""
     named = None if team is None else PAIRS.get((team.estimator, team.fusion))
     if named is None:
         return None
@@ -280,20 +266,15 @@ def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
 
     Fits one rigid motion, lever arm and time shift per team by least absolute distances.
     """
-    fixes = {robot: found for robot in paths if (found := _fixes(log, robot)) is not None}
-    if not fixes:
-        return None
+    fixes: dict[str, Fixes] = {}
+    for robot in paths:
+        for message in log.messages(ch.TRUTH_POSITIONS, m.TruthPositions, robot)[:1]:
+            at_ns = stamps(message.stamps, "stamps").astype(np.int64)
+            if len(at_ns) > 1:
+                places = floats(message.positions, "positions").astype(np.float64)
+                fixes[robot] = at_ns, places.reshape(-1, 2)
     medians = [_median(fixes, paths, float(shift)) for shift in SHIFTS_S]
     return min((each for each in medians if each is not None), default=None)
-
-
-def _fixes(log: Collected, robot: str) -> Fixes | None:
-    message = next(iter(log.messages(ch.TRUTH_POSITIONS, m.TruthPositions, robot)), None)
-    if message is None:
-        return None
-    places = floats(message.positions, "positions").astype(np.float64).reshape(-1, 2)
-    at_ns = stamps(message.stamps, "stamps").astype(np.int64)
-    return (at_ns, places) if len(at_ns) > 1 else None
 
 
 def _median(fixes: Mapping[str, Fixes], paths: Mapping[str, Path], shift_s: float) -> float | None:
@@ -340,7 +321,7 @@ def distances(
     return found
 
 
-def map_result(
+def _map_result(
     log: Collected,
     message: m.FusedMap,
     true: TrueLandmarks,
@@ -349,18 +330,20 @@ def map_result(
     *,
     arbitrary: bool,
 ) -> MapResult:
-    """Evaluate the final map.
-
-    truth_from_map: motion by which unnamed landmarks are matched to true ones; None: unknown.
-    """
+    """truth_from_map: motion by which unnamed landmarks are matched to true ones; None: unknown."""
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
     labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
     truth, known = true.match(labels)
     matching = None
-    if not label_of and truth_from_map is not None:
-        at = transform_points(truth_from_map, means)
-        matching = _match_unnamed(ids, at, true, truth, known)
+    unnamed = np.flatnonzero((ids >= UNNAMED) & ~known)
+    if not label_of and truth_from_map is not None and len(unnamed):
+        free = true.positions[~np.isin(true.ids, ids)]
+        found = nearest(transform_points(truth_from_map, means[unnamed]), free)
+        if found is not None:
+            rows, matching = found
+            truth[unnamed[rows >= 0]] = free[rows[rows >= 0]]
+            known[unnamed[rows >= 0]] = True
     errors = _errors(means, covariance, truth, known)
     return MapResult(
         rule=message.rule,
@@ -392,9 +375,7 @@ def map_result(
 
 
 def _name_points(log: Collected, found: m.Diagnosis) -> m.Diagnosis:
-    """Add the frame of points to the remedy of a scale that noise does not explain, where the
-    robots measure points.
-    """
+    """Add the frame of points to the remedy of a contradiction that noise does not explain."""
     robots = in_order({robot for (robot, _), timed in log.timed.items() if timed.has_points})
     of = [robot for robot in robots if found.robot in ("", robot)]
     if not of or not contradicts(found):
@@ -412,25 +393,6 @@ def _is_refuted(found: m.Diagnosis, errors: MapErrors | None, *, arbitrary: bool
     return errors.shape is not None and errors.shape.nees_per_landmark > 2.0
 
 
-def _match_unnamed(
-    ids: UInt32[np.ndarray, " L"],
-    means: Float[np.ndarray, "L 2"],
-    true: TrueLandmarks,
-    truth: Float[np.ndarray, "L 2"],
-    known: Bool[np.ndarray, " L"],
-) -> Matching | None:
-    unnamed = np.flatnonzero((ids >= UNNAMED) & ~known)
-    free = true.positions[~np.isin(true.ids, ids)]
-    found = nearest(means[unnamed], free) if len(unnamed) else None
-    if found is None:
-        return None
-    rows, matching = found
-    near = rows >= 0
-    truth[unnamed[near]] = free[rows[near]]
-    known[unnamed[near]] = True
-    return matching
-
-
 def _gospa(
     means: Float[np.ndarray, "L 2"], errors: MapErrors | None, positions: Float[np.ndarray, "T 2"]
 ) -> Gospa | None:
@@ -440,8 +402,7 @@ def _gospa(
     return gospa(transform_points(errors.truth_from_map, means), positions, cut_off_m)
 
 
-def own_map(log: Collected, robot: str, true: TrueLandmarks) -> MapErrors | None:
-    """Evaluate a robot's last own map; None without one or without truth."""
+def _own_map(log: Collected, robot: str, true: TrueLandmarks) -> MapErrors | None:
     message = log.newest(ch.OWN_MAP, m.MapEstimate, robot)
     if message is None:
         return None

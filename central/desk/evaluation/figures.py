@@ -21,6 +21,10 @@ _NOT_JOINED = (
     ("needed", "too_little_shared"),
     ("shared", "too_little_shared"),
 )
+_ABSENT = {
+    "not joined": (_NOT_JOINED, "no_place_found"),
+    "withdrawn": ((("by central:", "contradicts_the_rest"),), "ordered"),
+}
 _WARNINGS = (
     ("left out", "landmarks_left_out"),
     ("refused", "refused"),
@@ -108,16 +112,17 @@ IN_THE_FRAME = frozenset({
 """Unaligned figures, meaningless in an arbitrary frame."""
 _SCORES = {each: each for each in ("precision", "recall", "f1", "wrong_percent")}
 _ASSOCIATION = {
-    each: each
-    for each in (
-        "landmarks", "duplicates", "duplicates_confirmed", "duplicates_shown", "merges_right",
-        "merges_wrong", "merges_refused",
-    )
-} | {
+    "landmarks": "landmarks",
+    "duplicates": "duplicates",
+    "duplicates_confirmed": "duplicates_confirmed",
+    "duplicates_shown": "duplicates_shown",
+    "merges_right": "merges_right",
+    "merges_wrong": "merges_wrong",
+    "merges_refused": "merges_refused",
     "labelled_detections": "pairs.detections",
     "labelled_detections_left_out": "left_out",
     "unlabelled_detections_in_the_map": "clutter_in_map",
-}  # fmt: skip
+}
 
 
 def _named(of: object, paths: Mapping[str, str], *, arbitrary: bool = False) -> dict[str, Any]:
@@ -130,33 +135,24 @@ def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> d
     """Collect the figures under their JSON names; `extra` replaces or adds some."""
     fused, association = evaluation.map, evaluation.association
     states, arbitrary = evaluation.states, evaluation.arbitrary_frame
-    of_map: dict[str, Any] = {
-        "landmarks": None,
-        "landmark_matching": None,
-        "map_covariance": None,
-        "final_map_sha256": None,
-        "gospa": None,
-        "joined": [],
-        "changes": [],
-    }
-    if fused is not None:
-        of_map = {
-            "landmarks": len(fused.ids),
-            "landmark_matching": fused.matching and asdict(fused.matching),
-            "map_covariance": "joint" if fused.joint else "blocks",
-            "final_map_sha256": None if evaluation.disagreement else fused.payload_sha256,
-            "gospa": fused.gospa and asdict(fused.gospa),
-            "joined": list(fused.joined),
-            "changes": [change_json(each) for each in fused.changes],
-        }
+    gospa, matching = figure(fused, "gospa"), figure(fused, "matching")
     return {
         **_named(evaluation, _TEAM, arbitrary=arbitrary),
-        **of_map,
+        "landmarks": fused and len(fused.ids),
+        "landmark_matching": matching and asdict(matching),
+        "map_covariance": fused and ("joint" if fused.joint else "blocks"),
+        "final_map_sha256": None if evaluation.disagreement else figure(fused, "payload_sha256"),
+        "gospa": gospa and asdict(gospa),
+        "joined": [] if fused is None else list(fused.joined),
+        "changes": [] if fused is None else [_change(each) for each in fused.changes],
         "data_set": evaluation.data_set or None,
         "diagnosis": [to_object(each) for each in evaluation.diagnosis],
         "not_joined": _absent_robots(states, "not joined"),
         "withdrawn": _absent_robots(states, "withdrawn"),
-        "warnings": _warning_objects(evaluation.other_warnings),
+        "warnings": [
+            {"cause": _cause(each, _WARNINGS, "other"), "text": each}
+            for each in evaluation.other_warnings
+        ],
         "robot_states": {name: of._asdict() for name, of in states.items()},
         "robots": {
             name: _named(robot, _ROBOT, arbitrary=arbitrary)
@@ -178,17 +174,9 @@ def association_json(result: AssociationResult) -> dict[str, Any]:
     return _named(result.pairs, _SCORES) | windows | _named(result, _ASSOCIATION)
 
 
-def change_json(change: m.LandmarkChange) -> dict[str, Any]:
-    """A landmark's state against the saved maps; `expected`: missed observations."""
-    return {
-        "landmark": change.landmark,
-        "state": change.state,
-        "dx_m": change.dx,
-        "dy_m": change.dy,
-        "sigma_m": change.sigma,
-        "chi2": change.chi2,
-        "expected": change.expected,
-    }
+def _change(change: m.LandmarkChange) -> dict[str, Any]:
+    found = msgspec.structs.asdict(change)
+    return {f"{k}_m" if k in ("dx", "dy", "sigma") else k: v for k, v in found.items()}
 
 
 def _cause(text: str, table: Iterable[tuple[str, str]], otherwise: str) -> str:
@@ -196,17 +184,9 @@ def _cause(text: str, table: Iterable[tuple[str, str]], otherwise: str) -> str:
 
 
 def _absent_robots(states: Mapping[str, RobotState], state: str) -> list[dict[str, str]]:
-    found = []
-    for robot, of in states.items():
-        if of.state != state:
-            continue
-        if state == "withdrawn":
-            cause = "contradicts_the_rest" if of.why.startswith("by central") else "ordered"
-        else:
-            cause = _cause(of.why, _NOT_JOINED, "no_place_found")
-        found.append({"robot": robot, "cause": cause, "text": of.why})
-    return found
-
-
-def _warning_objects(texts: Iterable[str]) -> list[dict[str, str]]:
-    return [{"cause": _cause(each, _WARNINGS, "other"), "text": each} for each in texts]
+    table, otherwise = _ABSENT[state]
+    return [
+        {"robot": robot, "cause": _cause(of.why, table, otherwise), "text": of.why}
+        for robot, of in states.items()
+        if of.state == state
+    ]

@@ -117,6 +117,12 @@ class Collected:
         names = sorted(name for key in self.samples if (name := channel.owner(key)) is not None)
         return [each for name in names for each in self.messages(channel, kind, name)]
 
+    def figures(self, node: str, prefix: str = "") -> dict[str, float]:
+        """Newest figures of a node whose names begin with a prefix, without it."""
+        status = self.newest(ch.STATUS, m.Status, node)
+        found = {} if status is None else status.figures
+        return {k.removeprefix(prefix): v for k, v in found.items() if k.startswith(prefix)}
+
     def sound(self, sample: Sample | None) -> m.Message | None:
         """Decode a sample; None if invalid, which is counted once."""
         if sample is None:

@@ -1,6 +1,6 @@
 """One robot in a log: poses, truth, dispositions."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -66,24 +66,18 @@ def _consumption(log: Collected, robot: str) -> Consumption:
             ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.measurements
     measurements = log.measurements.get(robot)
     consumed = sum(d.measurements for d in dones.values()) if dones else None
-    return Consumption(
-        0 if measurements is None else len(measurements.odometry),
-        0 if measurements is None else len(measurements.all),
-        consumed,
-        len(submaps),
-        ledger,
-        None
-        if consumed is None
-        else sum(ledger.values()) == consumed
-        and _disjoint([submaps[name] for name in sorted(submaps)]),
-        sum(submap.gated for submap in submaps.values()),
-    )
-
-
-def _disjoint(submaps: Sequence[m.Submap]) -> bool:
-    return all(
+    are_disjoint = all(
         a.incarnation != b.incarnation or a.last_measurement < b.first_measurement
-        for a, b in pairwise(submaps)
+        for a, b in pairwise(submaps[name] for name in sorted(submaps))
+    )
+    return Consumption(
+        steps=0 if measurements is None else len(measurements.odometry),
+        published=0 if measurements is None else len(measurements.all),
+        consumed=consumed,
+        submaps=len(submaps),
+        ledger=ledger,
+        each_once=None if consumed is None else are_disjoint and sum(ledger.values()) == consumed,
+        gated=sum(submap.gated for submap in submaps.values()),
     )
 
 
@@ -103,8 +97,8 @@ def peer_results(log: Collected) -> dict[str, PeerResult]:
     """Result of every robot with a copy of the set."""
     found = {}
     for robot in log.robots:
-        status = log.newest(ch.STATUS, m.Status, ch.robot_node(robot))
-        figures = {} if status is None else status.figures
+        node = ch.robot_node(robot)
+        figures = log.figures(node)
         if "set_submaps" not in figures:
             continue
         sample = log.latest.get(ch.CONCLUDED.key(robot))
@@ -117,15 +111,7 @@ def peer_results(log: Collected) -> dict[str, PeerResult]:
             uplink_bytes=int(figures.get("set_uplink_bytes", 0.0)),
             downlink_bytes=int(figures.get("set_downlink_bytes", 0.0)),
             agrees_with=int(figures.get("set_agrees", 0.0)),
-            have=_named(figures, "set_submaps."),
-            over=_named(figures, "set_over."),
+            have={name: int(n) for name, n in log.figures(node, "set_submaps.").items()},
+            over={name: int(n) for name, n in log.figures(node, "set_over.").items()},
         )
     return found
-
-
-def _named(figures: Mapping[str, float], prefix: str) -> dict[str, int]:
-    return {
-        name.removeprefix(prefix): int(value)
-        for name, value in figures.items()
-        if name.startswith(prefix)
-    }

@@ -43,6 +43,7 @@ def robot_states(
     }
     orders = (each for of in (ch.WITHDRAWAL, ch.ORDER) for each in log.of_all(of, m.Withdrawal))
     because = {each.robot: f"by {each.by}: {each.reason}" for each in orders}  # orders prevail
+    reason_of = {who: why for who, _, why in (r.partition(": ") for r in fused.reasons[::-1])}
 
     def state_of(name: str) -> RobotState:
         if name in fused.withdrawn:
@@ -53,14 +54,9 @@ def robot_states(
             return RobotState("not joined", apart[name])
         if name in members:
             return RobotState("joined")
-        return RobotState("not joined", _reason_in(fused, name) or NO_MEMBER)
+        return RobotState("not joined", reason_of.get(name) or NO_MEMBER)
 
     return {name: state_of(name) for name in in_order(team)}
-
-
-def _reason_in(fused: m.FusedMap, name: str) -> str:
-    found = (each.partition(": ") for each in fused.reasons)
-    return next((why for who, _, why in found if who == name), "")
 
 
 NO_LANDMARK = (

@@ -20,16 +20,15 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, try_open
 from teamslam.team.wire.messages import FusedMap, Status
 
-VIEWED = frozenset(channel.name for channel in (*ViewerNode.listens, ch.ALIVE))
+VIEWED = frozenset((*ViewerNode.listens, ch.ALIVE))
 """Channels of a viewer."""
 
 
 def for_viewer(
-    sample: Sample, channels: Collection[str] = VIEWED
+    sample: Sample, channels: Collection[ch.Channel] = VIEWED
 ) -> tuple[ch.Channel, m.Message] | None:
     """Channel and message of a sample of these channels; None for others."""
-    found = ch.channel_of(sample.key)
-    if found is None or found[0].name not in channels:
+    if ch.row_of(sample.key) not in channels:
         return None
     sound = try_open(sample)
     return None if sound is None else (sound[0], sound[2])
@@ -124,9 +123,8 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
     while not (viewing.node.finished or final is not None or stop.is_set()):
         if time.monotonic() >= due:
             due = time.monotonic() + STATUS_S
-            status = Status(
-                stamp_ns=0, node=NODE, state="viewing", figures={"messages": float(published)}
-            )
+            figures = {"messages": float(published)}
+            status = Status(stamp_ns=0, node=NODE, state="viewing", figures=figures)
             bus.publish(Outgoing(ch.STATUS, NODE, status))
         for sample in with_centre_messages(centre, (*bus.receive(WAIT_S), *end.find_missed())):
             if ch.ALIVE.owner(sample.key) == NODE:

@@ -4,6 +4,8 @@ A new subscriber receives the newest view of its topic at once.
 """
 
 import logging
+import secrets
+import socket
 import threading
 from typing import Self
 
@@ -11,7 +13,6 @@ import foxglove
 from foxglove import Channel, Context, Schema
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
-from teamslam.central.desk.view.foxglove_proxy import hidden_host
 from teamslam.team.recording.schemas import declaration_of
 from teamslam.team.wire.bus import Sample
 
@@ -27,7 +28,7 @@ class FoxgloveServer(ServerListener):
         self._newest: dict[str, Sample] = {}
         self._lock = threading.Lock()
         foxglove.set_log_level(logging.WARNING)  # it prints its hidden address otherwise
-        hidden = hidden_host()
+        hidden = _hidden_host()
         self._server = foxglove.start_server(
             name="teamslam",
             host=hidden,
@@ -73,3 +74,13 @@ class FoxgloveServer(ServerListener):
         return Channel(
             topic, schema=schema, message_encoding=declaration.encoding, context=self._context
         )
+
+
+def _hidden_host() -> str:
+    """Loopback address that no page can guess."""
+    host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}.{secrets.randbelow(254) + 1}"
+    try:
+        socket.create_server((host, 0)).close()
+    except OSError:
+        return "127.0.0.1"
+    return host

@@ -46,12 +46,11 @@ MAP_SPACING_NS = 1_000_000_000
 SEEN_NS = 500_000_000
 """Least time between measurements of one landmark sent to the page."""
 CHANNELS = frozenset(
-    channel.name
-    for channel in (*ViewerNode.listens, ch.ALIVE, ch.ROBOT_CONFIG, ch.OBSERVATIONS, ch.SIGHTINGS)
+    (*ViewerNode.listens, ch.ALIVE, ch.ROBOT_CONFIG, ch.OBSERVATIONS, ch.SIGHTINGS)
 )
 """Channels whose messages `PageFrames.take` converts."""
 _OF_A_SET = ("set_submaps", "set_agrees")
-_BEGIN = frozenset(channel.name for channel in (*ch.SENSORS, ch.TRUTH))
+_BEGIN = frozenset((*ch.SENSORS, ch.TRUTH))
 
 
 def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
@@ -112,20 +111,18 @@ class PageFrames:
 
     def count(self, sample: Sample) -> None:
         """Count a sample as traffic; emit a link for a submap or prior."""
-        found = ch.channel_of(sample.key)
-        channel, name = ("", "") if found is None else (found[0].name, found[1])
+        channel, name = ch.channel_of(sample.key) or (None, "")
         if self._origin_ns is None and channel in _BEGIN:
             self._origin_ns = sample.stamp_ns
         place = (sample.key, int(self._t(sample.stamp_ns)))
         counted = self._traffic.setdefault(place, [0, 0])
         counted[0] += 1
         counted[1] += len(sample.payload)
-        if channel in (ch.SUBMAP.name, ch.PRIOR.name):
-            link = (name, "central") if channel == ch.SUBMAP.name else ("central", name)
-            t = self._t(
-                max(sample.stamp_ns, self._newest_ns)
-            )  # a prior follows the poses before it
-            self._add_frame("link", t=t, a=link[0], b=link[1])
+        if channel in (ch.SUBMAP, ch.PRIOR):
+            a, b = (name, "central") if channel is ch.SUBMAP else ("central", name)
+            # A prior follows the poses before it.
+            t = self._t(max(sample.stamp_ns, self._newest_ns))
+            self._add_frame("link", t=t, a=a, b=b)
 
     def flush(self, now_ns: int | None = None) -> list[str]:
         """Return the frames since the last call; now_ns: team time of the robots."""

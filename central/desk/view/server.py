@@ -1,7 +1,8 @@
 """Serve a log: page with a WebSocket stream of frames, and Foxglove's WebSocket.
 
 A new connection receives every frame of the log, then new ones. Pages of another origin or host
-name (DNS rebinding) are refused.
+name (DNS rebinding) are refused. Foxglove's SDK accepts any origin, so its server listens at a
+random loopback address and port behind a proxy, which checks Host and Origin.
 """
 
 import asyncio
@@ -10,8 +11,8 @@ import logging
 import os
 import socket
 import threading
-from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager, nullcontext
+from collections.abc import Collection, Iterator
+from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
@@ -19,14 +20,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
 
 from teamslam.central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
 from teamslam.central.desk.view.export import VIEWED, Viewing, for_viewer
-from teamslam.central.desk.view.foxglove_proxy import proxy, refuse
 from teamslam.central.desk.view.page_frames import CHANNELS, PageFrames
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.tail import Tail
@@ -35,6 +37,10 @@ from teamslam.team.wire.bus import BusError, Sample
 if TYPE_CHECKING:
     from teamslam.central.desk.view.foxglove_server import FoxgloveServer
 
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+VIEWERS = (*LOOPBACK, "https://app.foxglove.dev", "file://")
+"""Origins of viewers: this machine's hosts and Foxglove."""
+PROTOCOLS = tuple(map(Subprotocol, ("foxglove.sdk.v1", "foxglove.websocket.v1")))
 STREAM = "/stream"
 LOOK_S = 0.2
 """Polling period [s] of a growing log."""
@@ -45,7 +51,14 @@ _TYPES = {
     ".css": "text/css",
     ".svg": "image/svg+xml",
 }
-_POLICY = "default-src 'self'; connect-src 'self' ws: wss:; style-src 'self' 'unsafe-inline'"
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; connect-src 'self' ws: wss:; style-src 'self' 'unsafe-inline'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Connection": "close",
+}
 
 
 class ServerError(BusError):
@@ -54,13 +67,10 @@ class ServerError(BusError):
 
 def page_files() -> dict[str, tuple[str, bytes]]:
     """Type and bytes of every page file by path."""
-    found = {}
-    for file in files("teamslam.central.desk.view").joinpath("page").iterdir():
-        suffix = Path(file.name).suffix
-        if suffix in _TYPES:
-            found[f"/{file.name}"] = (_TYPES[suffix], file.read_bytes())
-    found["/"] = found["/index.html"]
-    return found
+    folder = files("teamslam.central.desk.view").joinpath("page").iterdir()
+    of = ((file, _TYPES.get(Path(file.name).suffix)) for file in folder)
+    found = {f"/{file.name}": (kind, file.read_bytes()) for file, kind in of if kind is not None}
+    return found | {"/": found["/index.html"]}
 
 
 @dataclass
@@ -108,19 +118,72 @@ class Feed:
         if input_ is None:
             return
         self._page.take(*input_)
-        if input_[0].name in VIEWED:
+        if input_[0] in VIEWED:
             for view in self._viewing.take(sample, input_):
                 if self.foxglove is not None:
                     self.foxglove.publish(view)
 
     def _faults(self) -> list[str]:
-        found = [] if self.error is None else [self.error]
-        if self.tail.damaged:
-            found.append(
-                f"{self.tail.damaged} damaged parts of the log were left out; "
-                "`teamslam log check` names them"
-            )
-        return found
+        damaged = (
+            f"{self.tail.damaged} damaged parts of the log were left out; `teamslam log check` "
+            "names them"
+        )
+        return [*filter(None, [self.error]), *[damaged] * bool(self.tail.damaged)]
+
+
+def refusal(
+    listening_at: str, host: str, origins: list[str], others: Collection[str] = ()
+) -> str | None:
+    """Reason to refuse a request for `host` from these origins, or None.
+
+    listening_at: own address; a loopback request under another name is refused. others: further
+    permitted origins or hosts.
+    """
+    if listening_at in LOOPBACK and (urlsplit(f"//{host}").hostname or "") not in LOOPBACK:
+        return f"{host!r} is not this machine\n"
+    if len(origins) > 1:
+        return "two origins\n"
+    for origin in origins:
+        at = urlsplit(origin)
+        if not ((host and at.netloc == host) or at.hostname in others or origin in others):
+            return f"{origin!r} is another page's origin\n"
+    return None
+
+
+def _refuse(
+    listening_at: str, viewer: ServerConnection, request: Request, others: Collection[str] = ()
+) -> Response | None:
+    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    why = refusal(listening_at, hosts[0] if hosts else "", origins, others)
+    return None if why is None else viewer.respond(HTTPStatus.FORBIDDEN, why)
+
+
+async def _proxy(host: str, port: int, behind: str) -> Server:
+    """Listen for viewers of the SDK's server at `behind`. Raises OSError."""
+    return await serve(
+        lambda viewer: _forward(viewer, behind), host, port,
+        process_request=lambda viewer, request: _refuse(host, viewer, request, VIEWERS),
+        subprotocols=PROTOCOLS, compression=None, max_size=None,
+    )  # fmt: skip
+
+
+async def _forward(viewer: ServerConnection, behind: str) -> None:
+    chosen = PROTOCOLS if viewer.subprotocol is None else (viewer.subprotocol,)
+    async with connect(behind, subprotocols=chosen, compression=None, max_size=None) as server:
+        ways = [asyncio.ensure_future(_pump(viewer, server))]
+        ways.append(asyncio.ensure_future(_pump(server, viewer)))
+        await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        for way in ways:
+            way.cancel()
+    await viewer.close()
+
+
+async def _pump(
+    source: ServerConnection | ClientConnection, sink: ServerConnection | ClientConnection
+) -> None:
+    with suppress(ConnectionClosed):
+        async for frame in source:
+            await sink.send(frame)
 
 
 class PageServer:
@@ -136,13 +199,9 @@ class PageServer:
     async def start(self, port: int) -> Server:
         """Listen. Raises OSError."""
         return await serve(
-            self._stream,
-            self._host,
-            port,
-            process_request=self._answer,
-            compression=None,
+            self._stream, self._host, port, process_request=self._answer, compression=None,
             max_size=1024,
-        )
+        )  # fmt: skip
 
     async def read(self, stop: asyncio.Event) -> None:
         """Read the log until its end or `stop`."""
@@ -154,29 +213,20 @@ class PageServer:
                 await asyncio.sleep(LOOK_S)
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        refused = refuse(self._host, connection, request)
+        refused = _refuse(self._host, connection, request)
         path = urlsplit(request.path).path
         if refused is not None or path == STREAM:
             return refused
         if path not in self._files:
             return connection.respond(HTTPStatus.NOT_FOUND, "no such file\n")
         kind, body = self._files[path]
-        headers = Headers(
-            {
-                "Content-Type": f"{kind}; charset=utf-8",
-                "Content-Length": str(len(body)),
-                "Content-Security-Policy": _POLICY,
-                "X-Content-Type-Options": "nosniff",
-                "Cache-Control": "no-store",
-                "Connection": "close",
-            }
-        )
-        return Response(HTTPStatus.OK, "OK", headers, body)
+        of_file = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))}
+        return Response(HTTPStatus.OK, "OK", Headers(of_file | _HEADERS), body)
 
     async def _stream(self, connection: ServerConnection) -> None:
         sent = 0
         frames = self._feed.frames
-        try:
+        with suppress(ConnectionClosed):
             while True:
                 while sent < len(frames):
                     batch, size = [], 0
@@ -187,16 +237,10 @@ class PageServer:
                     await connection.send(f"[{','.join(batch)}]")
                 async with self._frame_ready:
                     if sent == len(frames):
-                        await self._wait(connection)
-        except ConnectionClosed:
-            pass
-
-    async def _wait(self, connection: ServerConnection) -> None:
-        """Wait for news or a timeout, and detect a closed page."""
-        try:
-            await asyncio.wait_for(self._frame_ready.wait(), 5.0)
-        except TimeoutError:
-            await connection.ping()
+                        try:
+                            await asyncio.wait_for(self._frame_ready.wait(), 5.0)
+                        except TimeoutError:  # detects a closed page
+                            await connection.ping()
 
 
 @dataclass(frozen=True)
@@ -255,7 +299,7 @@ def serving(
         servers.append(runner.run(page.start(port)))
         url, foxglove_url = f"http://{at}:{_port_of(servers[0])}/", ""
         if feed.foxglove is not None:
-            servers.append(runner.run(proxy(host, foxglove_port, feed.foxglove.url)))
+            servers.append(runner.run(_proxy(host, foxglove_port, feed.foxglove.url)))
             foxglove_url = f"ws://{at}:{_port_of(servers[1])}"
     except OSError as error:
         stop.set()  # close a server that already listens
@@ -264,11 +308,11 @@ def serving(
             raise ServerError(
                 f"--host {host}: {_reason(error)}; give an address of this machine"
             ) from error
-        what, number, option = (
-            ("Foxglove", foxglove_port, "--foxglove-port")
-            if servers
-            else ("the page", port, "--port")
+        foxglove, of_page = (
+            ("Foxglove", foxglove_port, "--foxglove-port"),
+            ("the page", port, "--port"),
         )
+        what, number, option = foxglove if servers else of_page
         raise ServerError(
             f"can not serve {what} at {host}:{number}: {_reason(error)}; choose another {option}, "
             "0 for any free one"
@@ -284,15 +328,12 @@ def serving(
 
 def free_port(host: str, port: int) -> int:
     """Return `port`, or 0 (any free one) if it is taken."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        socket.create_server((host, port), family=_family(host)).close()
+        socket.create_server((host, port), family=family).close()
     except OSError as error:
         return 0 if error.errno == errno.EADDRINUSE else port
     return port
-
-
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
 def _reason(error: OSError) -> str:

@@ -20,11 +20,19 @@ from websockets.sync.client import connect
 from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.view.export import with_views
-from teamslam.central.desk.view.foxglove_proxy import VIEWERS, refusal
 from teamslam.central.desk.view.layout import layout
 from teamslam.central.desk.view.node import ViewerNode
 from teamslam.central.desk.view.page_frames import PageFrames
-from teamslam.central.desk.view.server import Feed, ServerError, Shown, page_files, serving, session
+from teamslam.central.desk.view.server import (
+    VIEWERS,
+    Feed,
+    ServerError,
+    Shown,
+    page_files,
+    refusal,
+    serving,
+    session,
+)
 from teamslam.sim.cli import view
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.recorder import Recorder
