@@ -9,14 +9,13 @@ from importlib import metadata
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
-import jaxtyping
 import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from benchmarks.baseline import baselines
-from teamslam.team import extras, shapes
+from teamslam.team import extras
 from tests.support import ROOT
 
 BUILDING = ("cmake", "nanobind", "ninja", "scikit-build-core")
@@ -187,10 +186,6 @@ def test_a_launch_and_its_report_need_no_scipy():
     assert "scipy" not in closure(*PROJECT["dependencies"])
 
 
-def test_shapes_are_checked_in_tests():
-    assert shapes.Float is jaxtyping.Float
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's threads")
 def test_the_linear_algebra_of_a_command_has_one_thread():
     code = (
@@ -244,20 +239,6 @@ def test_the_compose_file_is_valid_by_the_compose_specification():
     command = [sys.executable, "-m", "check_jsonschema", *schema, str(COMPOSE)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout
-
-
-def test_every_service_runs_the_command_that_its_name_says(compose):
-    commands = {name: service["command"] for name, service in compose["services"].items()}
-    reach = ["--connect", "tcp/router:7447"]
-    assert commands == {
-        "router": ["router", "--listen", "tcp/0.0.0.0:7447", "--insecure"],
-        "world": ["world", "waypoints", *reach],
-        "r1": ["robot", "waypoints", "r1", *reach],
-        "r2": ["robot", "waypoints", "r2", *reach],
-        "r3": ["robot", "waypoints", "r3", *reach],
-        "central": ["central", "waypoints", *reach],
-        "recorder": ["record", "waypoints", *reach, "--output", "/logs/team.mcap"],
-    }
 
 
 def test_nothing_is_published_beyond_the_host_itself(compose):

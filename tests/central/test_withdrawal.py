@@ -56,7 +56,7 @@ def scenario(robots: int = 3, steps: int = 60, **central: object) -> Scenario:
 
 
 def run(of: Scenario, wrong: str = "") -> list[Sample]:
-    motion, sensor = MOTION, SENSOR
+    sensor = SENSOR
     if wrong == "bearing":
         sensor = msgspec.structs.replace(SENSOR, bearing_offset=0.3)
     if wrong == "range":
@@ -73,7 +73,6 @@ def run(of: Scenario, wrong: str = "") -> list[Sample]:
                 for s in streams.streams
             ),
         )
-    assert motion is MOTION
     return list(run_team(of, streams))
 
 

@@ -6,16 +6,13 @@ from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
+from tests.estimation.submap_world import wrap
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.01)
 OTHER = Sensor(range_sigma=0.3, bearing_sigma=0.005)
 MOTION = Increment(np.array([0.5, 0.0, 0.15]), np.diag([0.03, 0.02, 0.01]) ** 2)
 LANDMARKS = np.array([[6.0, 1.0], [-3.0, 5.0], [0.0, -7.0], [4.0, 8.0]])
 STARTS = {"r1": np.array([0.5, -1.0, 0.0]), "r2": np.array([1.0, 3.0, -2.0])}
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def team_run(seed, starts=STARTS, steps=8, seen=None):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from teamslam.team import core
 from teamslam.team.config import Bounds, Sensor
@@ -81,17 +82,19 @@ def test_points_near_with_much_noise_place_a_landmark_without_a_bias():
     assert found[POLAR] > 50.0, "as range and bearing they read too far: the test has power"
 
 
+@pytest.mark.parametrize("has_own", [True, False])
 @pytest.mark.parametrize("whites", [(1.0, 1.0), (0.4, 1.0), (0.5, 0.3)])
-def test_landmarks_along_paths_with_own_noises_are_least_squares(whites):
+def test_landmarks_along_paths_are_least_squares_with_the_windows_correlations(whites, has_own):
     rng = np.random.default_rng(2)
     path = np.column_stack((np.arange(5.0), 0.1 * np.arange(5.0), 0.2 * np.arange(5.0)))
     truth = np.array([4.0, 6.0])
     z = np.array([predicted(pose, truth) for pose in path])
     A = rng.normal(size=(5, 2, 2)) * np.array([0.2, 0.03])[:, None]
-    R = A @ A.transpose(0, 2, 1) + np.diag([0.01, 4e-4])
+    R = A @ A.transpose(0, 2, 1) * has_own + np.diag([0.01, 4e-4])
     z = z + 0.3 * np.array([np.linalg.cholesky(each) @ rng.normal(size=2) for each in R])
-    own = np.array([[*packed(each), POLAR] for each in R])
-    noise = noise_of(Sensor(range_white=whites[0], bearing_white=whites[1]))
+    own = np.array([[*packed(each), POLAR] for each in R]) if has_own else unclaimed(5)
+    sensor = Sensor(range_sigma=0.1, bearing_sigma=0.02)
+    noise = noise_of(replace(sensor, range_white=whites[0], bearing_white=whites[1]))
     means, covariances = landmarks_along_paths(
         IDS, truth.reshape(1, 1, 2) + 0.02, np.array([[[1.0, 0.0, 1.0]]]), path[:, None, :],
         np.arange(5), IDS.repeat(5), z, own, noise,

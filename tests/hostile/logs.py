@@ -16,6 +16,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import encoded
 from tests import build
+from tests.recording.test_log import bomb
 from tests.support import packed, spd
 
 LARGEST_FILE = 16 * 1024
@@ -59,15 +60,7 @@ def records_of(told: Sequence[tuple[ch.Channel, str, bytes]]) -> bytes:
 
 
 def expands(path: Path) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start()
-        writer.add_metadata("teamslam", {"team": "demo"})
-        data = zstandard.compress(bytes(500 * 10**6), 19)
-        body = struct.pack("<QQQII", 0, 0, 500 * 10**6, 0, 4) + b"zstd"
-        body += struct.pack("<Q", len(data)) + data
-        file.write(struct.pack("<BQ", Opcode.CHUNK, len(body)) + body)
-        writer.finish()
+    bomb(path, 500 * 10**6, 500 * 10**6)
     return path
 
 

@@ -313,9 +313,6 @@ def test_a_schema_is_held_against_its_channel(path, key, encoding, schema, text,
     assert found is None if told is None else found is not None and found.startswith(told)
 
 
-# Summary.
-
-
 # Cut and merge.
 
 

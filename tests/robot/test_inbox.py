@@ -57,17 +57,6 @@ def test_a_later_incarnation_whose_beginning_is_missing_is_a_gap():
     assert inbox.gap == (1, 0, 2)
 
 
-def test_a_later_incarnation_begins_with_its_measurement_0_and_the_earlier_one_is_over():
-    inbox = Inbox()
-    for number in (0, 2):
-        inbox.put(measurement(number))
-    inbox.put(measurement(0, incarnation=5))
-    assert names(inbox) == [(0, 0), (5, 0)]
-    inbox.put(measurement(1))
-    assert names(inbox) == []
-    assert (inbox.incarnation, inbox.next_measurement, waiting(inbox)) == (5, 1, 0)
-
-
 def test_what_an_earlier_life_consumed_is_not_taken_again():
     inbox = Inbox()
     for number in range(6):

@@ -17,7 +17,6 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
-from teamslam.team.wire.digest import digest_of
 from tests.support import fused_map, packed, spd
 from tests.teams import config, driven, of, published, stream
 
@@ -205,31 +204,6 @@ def test_what_is_stamped_behind_its_window_is_in_no_submap_also_after_a_restart(
         node = RobotNode(config(front_end=front_end))
         node.resume(measurements[0], whole[:taken])
         assert payloads(driven(node, measurements)) == [encoded(each) for each in whole[taken:]]
-
-
-@pytest.mark.parametrize("taken", [1, 2, 3])
-@pytest.mark.parametrize("name", ["observations between odometry stamps", "quick odometry"])
-def test_a_robot_that_was_started_again_sends_the_same_following_submaps(name, taken):
-    measurements = published(STREAMS[name])
-    front_end = msgspec.structs.replace(config().front_end, keyframe_s=0.3, window_s=0.6)
-    whole = of(driven(RobotNode(config(front_end=front_end)), measurements), ch.SUBMAP)
-    node = RobotNode(config(front_end=front_end))
-    node.resume(measurements[0], whole[:taken])
-    assert node.next_measurement == whole[taken - 1].last_measurement + 1
-    out = driven(node, measurements)
-    assert payloads(out) == [encoded(each) for each in whole[taken:]]
-    (done,) = of(out, ch.ROBOT_DONE)
-    assert sum(e.measurements for e in done.ledger) == done.measurements == len(measurements)
-
-
-def test_submaps_and_maps_name_the_configuration_that_was_announced():
-    node = RobotNode(config())
-    (announced,) = of(node.begin(), ch.ROBOT_CONFIG)
-    assert announced.digest == digest_of(announced.configuration.encode())
-    submaps = of(driven(node, MEASUREMENTS), ch.SUBMAP)
-    assert {each.config for each in submaps} == {announced.digest}
-    (other,) = of(RobotNode(config(seed=2)).begin(), ch.ROBOT_CONFIG)
-    assert other.digest != announced.digest
 
 
 def test_everything_it_sends_passes_the_door():

@@ -1,32 +1,14 @@
 import gc
 
-import msgspec
 import numpy as np
 
 from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.maps import CONDENSED
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.robot.submaps import Submaps
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.codec import decoded, encoded
-from tests.support import submap
 from tests.teams import config, driven, of, published, stream
-
-
-def start(incarnation: int) -> m.InitialPose:
-    return m.InitialPose(
-        stamp_ns=0, robot="r1", incarnation=incarnation, number=0, pose=b"", covariance=b""
-    )
-
-
-def sent(k: int, incarnation: int) -> m.Submap:
-    return msgspec.structs.replace(submap(k, robot="r1"), incarnation=incarnation)
-
-
-def request(**wanted: int) -> bytes:
-    return encoded(m.SubmapsRequest(stamp_ns=0, robot="r1", **wanted))
 
 
 def test_a_stored_submap_has_the_bits_of_the_window_that_closed():
@@ -68,17 +50,3 @@ def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages():
     node.handle(prior)
     driven(node, published(stream("r1", 70))[len(published(stream("r1", 60))) :], end=False)
     assert 0 < local_maps() - before <= 2 * CONDENSED
-
-
-def test_a_request_is_answered_by_incarnation_and_from_a_sequence_on():
-    submaps = Submaps("r1", "continuous")
-    for incarnation in (1, 2):
-        submaps.begin(start(incarnation))
-        for k in range(3):
-            submaps.close([], sent(k, incarnation))
-    answered = [decoded(each) for each in submaps.answer(request(incarnation=1, first=2))]
-    assert answered == [start(1), sent(2, 1)]
-    every = [decoded(each) for each in submaps.answer(request())]
-    assert [type(each).__name__ for each in every] == 2 * ["InitialPose", *3 * ["Submap"]]
-    assert len(submaps) == submaps.sent == 3
-    assert submaps.answer(request(incarnation=3)) == []

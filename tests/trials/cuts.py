@@ -36,10 +36,9 @@ Commands = Mapping[str, Sequence[str]]
 
 @dataclass
 class Run:
-    """Result of one run; kills and cuts: time [s after the start], node, duration [s]."""
+    """Result of one run; cuts: time [s after the start], node, duration [s]."""
 
     number: int
-    kills: list[tuple[float, str]] = field(default_factory=list)
     cuts: list[tuple[float, str, float]] = field(default_factory=list)
     exits: dict[str, int] = field(default_factory=dict)
     wall_s: float = 0.0
@@ -55,12 +54,10 @@ class Run:
 
     def __str__(self) -> str:
         cuts = ", ".join(f"{node} at {at:.1f} for {for_s:g}" for at, node, for_s in self.cuts)
-        kills = ", ".join(f"{node} at {at:.1f}" for at, node in self.kills)
         wrong = {node: status for node, status in self.exits.items() if status}
         words = [
             f"{self.number:3} {'good' if self.good else 'BAD '} {self.wall_s:5.1f} s",
             "map equal" if self.equal else "MAP DIFFERS",
-            f"killed {kills or 'nobody'}",
             f"cut {cuts or 'nobody'}",
             *([f"exits {wrong}"] if wrong else []),
             *([f"log lacks {', '.join(self.lacks)}"] if self.lacks else []),
@@ -106,12 +103,6 @@ class Team:
                 env={**os.environ, **ONE_THREAD},
             )  # fmt: skip
 
-    def restart(self, node: str) -> None:
-        """Kill a node and start it again; `ip netns exec` has become the process itself."""
-        self.started[node].kill()
-        self.started[node].wait()
-        self.start(node)
-
     def is_alive(self, node: str) -> bool:
         return self.started[node].poll() is None
 
@@ -131,26 +122,19 @@ def link_of(node: str) -> str:
     return node.replace("driver", "d")
 
 
-def disturb(run: Run, team: Team, mortal: Sequence[str], options: argparse.Namespace) -> None:
-    """Kill and cut at random times, until all have ended or time is over."""
+def disturb(run: Run, team: Team, options: argparse.Namespace) -> None:
+    """Cut links at random times, until all have ended or time is over."""
     rng = random.Random(f"{options.seed} {run.number}")
-    moments = [(rng.uniform(0.0, options.span), "kill") for _ in range(options.kills)]
-    moments += [(rng.uniform(0.0, options.span), "cut") for _ in range(options.cuts)]
-    moments.sort()
+    moments = sorted(rng.uniform(0.0, options.span) for _ in range(options.cuts))
     nodes = [node for node in team.started if node != "router"]
     hub = team.names["router"]
     mends: list[tuple[float, str]] = []
     began = time.monotonic()
     while (at := time.monotonic() - began) < options.timeout:
-        if moments and at >= moments[0][0]:
-            _, what = moments.pop(0)
-            alive = [node for node in mortal if team.is_alive(node)]
+        if moments and at >= moments[0]:
+            moments.pop(0)
             whole = [node for node in nodes if node not in {cut for _, cut in mends}]
-            if what == "kill" and alive:
-                node = rng.choice(alive)
-                team.restart(node)
-                run.kills.append((round(at, 1), node))
-            elif what == "cut" and whole:
+            if whole:
                 node, for_s = rng.choice(whole), rng.choice([0.3, 1.0, 3.0, options.longest])
                 ip("-n", hub, "link", "set", link_of(node), "down")
                 mends.append((at + for_s, node))
@@ -164,14 +148,9 @@ def disturb(run: Run, team: Team, mortal: Sequence[str], options: argparse.Names
 
 
 def play(
-    number: int,
-    folder: Path,
-    told: Commands,
-    expected: bytes,
-    options: argparse.Namespace,
-    mortal: Sequence[str] = (),
+    number: int, folder: Path, told: Commands, expected: bytes, options: argparse.Namespace
 ) -> Run:
-    """Run a team to its final map; mortal: nodes that may be killed."""
+    """Run a team to its final map."""
     run = Run(number)
     (folder / "run").mkdir()
     with network([link_of(node) for node in told]) as names:
@@ -179,7 +158,7 @@ def play(
         try:
             team.begin()
             began = time.monotonic()
-            disturb(run, team, mortal, options)
+            disturb(run, team, options)
             run.wall_s = time.monotonic() - began
         finally:
             run.exits = team.stop()
@@ -195,19 +174,6 @@ def play(
     return run
 
 
-def options_of(description: str, kills: int) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=10)
-    parser.add_argument("--kills", type=int, default=kills, help="in each run")
-    parser.add_argument("--cuts", type=int, default=5, help="in each run")
-    parser.add_argument("--longest", type=float, default=12.0, help="seconds of the longest cut")
-    parser.add_argument("--seed", default="1")
-    parser.add_argument("--timeout", type=float, default=600.0)
-    parser.add_argument("--keep", help="keep the folders of runs that went wrong here")
-    parser.add_argument("--json", type=Path)
-    return parser
-
-
 def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> int:
     """Make the missing runs, print them and the totals; return the exit status."""
     runs = []
@@ -220,9 +186,8 @@ def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> in
         if options.json:
             options.json.write_text(json.dumps([asdict(run) for run in runs]))
     good = sum(run.good for run in runs)
-    kills, cuts = (sum(len(getattr(run, what)) for run in runs) for what in ("kills", "cuts"))
     print(
-        f"{good} of {len(runs)} runs good, {kills} processes killed, {cuts} links cut; map equal "
+        f"{good} of {len(runs)} runs good, {sum(len(r.cuts) for r in runs)} links cut; map equal "
         f"in {sum(r.equal for r in runs)}, log whole in {sum(not r.lacks for r in runs)}; "
         f"load {os.getloadavg()[0]:.1f}"
     )
@@ -230,7 +195,14 @@ def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> in
 
 
 def main() -> int:
-    parser = options_of(__doc__, kills=0)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=10)
+    parser.add_argument("--cuts", type=int, default=5, help="in each run")
+    parser.add_argument("--longest", type=float, default=12.0, help="seconds of the longest cut")
+    parser.add_argument("--seed", default="1")
+    parser.add_argument("--timeout", type=float, default=600.0)
+    parser.add_argument("--keep", help="keep the folders of runs that went wrong here")
+    parser.add_argument("--json", type=Path)
     parser.add_argument("--span", type=float, default=12.0, help="seconds in which cuts begin")
     parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--speed", default="4")

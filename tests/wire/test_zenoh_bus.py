@@ -90,25 +90,6 @@ def test_a_cut_link_loses_nothing_but_streams(endpoint, behind):
     assert counters(arrived, "robot/bravo/submap") == [0]
 
 
-def test_one_message_that_falls_into_a_cut_comes_after_it(endpoint):
-    with (
-        Link(endpoint) as link,
-        ZenohBus("t", link.endpoint) as source,
-        ZenohBus("t", endpoint) as sink,
-    ):
-        flowing(source, sink, c.FINAL_MAP, c.ROBOT_DONE)
-        link.cut()
-        source.publish(
-            Outgoing(
-                c.ROBOT_DONE,
-                "alpha",
-                build.done(robot="alpha", incarnation=0, measurements=9, steps=9, submaps=1),
-            )
-        )
-        link.mend()
-        assert [sample.key for sample in received(sink, 1)] == ["robot/alpha/done"]
-
-
 def test_a_killed_process_loses_its_token(endpoint):
     program = (
         "import sys; from teamslam.team.wire.zenoh.bus import ZenohBus\n"

@@ -141,21 +141,15 @@ def test_a_path_fits_a_gps_of_another_frame_with_a_lever_and_some_fixes_that_are
 TRUE = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]])
 
 
-def test_of_equal_sets_in_another_order_it_is_zero():
-    found = gospa(TRUE[::-1], TRUE, 2.0)
-    assert (found.distance_m, found.missed, found.false) == (0.0, 0, 0)
-
-
-def test_each_missed_and_each_false_one_costs_half_the_square_of_the_cut_off():
+def test_each_missed_and_each_false_landmark_costs_half_the_square_of_the_cut_off():
+    equal = gospa(TRUE[::-1], TRUE, 2.0)
+    assert (equal.distance_m, equal.missed, equal.false) == (0.0, 0, 0)
     found = gospa(np.array([[0.3, 0.0], [9.0, 9.0]]), TRUE, 2.0)
     assert found.distance_m == pytest.approx(np.sqrt(0.09 + 0.5 * 4.0 * 3))
     assert (found.missed, found.false) == (2, 1)
     assert found.localisation_m == pytest.approx(0.3)
-
-
-def test_a_duplicate_is_a_false_one():
-    found = gospa(np.concatenate((TRUE, TRUE[:1] + 0.1)), TRUE, 2.0)
-    assert (found.missed, found.false) == (0, 1)
+    duplicate = gospa(np.concatenate((TRUE, TRUE[:1] + 0.1)), TRUE, 2.0)
+    assert (duplicate.missed, duplicate.false) == (0, 1)
 
 
 def test_the_cut_off_is_half_of_the_spacing():

@@ -1,10 +1,10 @@
 import json
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from teamslam.central.desk.compare import compare_rows
 from teamslam.central.desk.evaluation.errors import (
@@ -22,7 +22,6 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing, Sample
-from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.sim.logs import (
     final_map,
@@ -35,6 +34,7 @@ from tests.sim.logs import (
     without_starts,
     world_log,
 )
+from tests.sim.reruns import changed
 
 SECOND = 10**9
 numbers = st.floats(-50.0, 50.0)
@@ -134,40 +134,30 @@ def test_a_log_whose_map_is_off_by_a_known_shift_says_so():
         assert robot.online_aligned_rmse_m is None
 
 
+TOO_LARGE = (m.Diagnosis(cause="noise_overestimated", robot="r2", value=(0.4,)),)
+
+
 @pytest.mark.parametrize(("shift", "is_shown"), [(0.3, False), (0.05, True)])
 def test_covariances_are_not_called_too_large_where_the_errors_are_larger(shift, is_shown):
     """All submaps share the error, as of a late clock: their differences do not show it."""
-    too_large = m.Diagnosis(cause="noise_overestimated", robot="r2", value=(0.4,))
-    log = []
-    for sample in joined_log(scenario(robots=2), shift):
-        payload = sample.payload
-        if sample.key == ch.FINAL_MAP.key():
-            final = decoded(payload, m.FusedMap)
-            payload = encoded(msgspec.structs.replace(final, diagnosis=(too_large,)))
-        log.append(msgspec.structs.replace(sample, payload=payload))
-    run = evaluate(log)
-    assert run.map.diagnosis == ((too_large,) if is_shown else ())
+    log = joined_log(scenario(robots=2), shift)
+    run = evaluate(changed(log, ch.FINAL_MAP, lambda final: replace(final, diagnosis=TOO_LARGE)))
+    assert run.map.diagnosis == (TOO_LARGE if is_shown else ())
 
 
 @pytest.mark.parametrize(("stretch", "is_shown"), [(1.0, True), (1.5, False)])
 def test_in_an_arbitrary_frame_the_shape_alone_refutes_too_large_covariances(stretch, is_shown):
     """The truth lies elsewhere: its distance from the map is no error of it."""
-    too_large = m.Diagnosis(cause="noise_overestimated", robot="r2", value=(0.4,))
-    log = []
-    for sample in joined_log(without_starts(scenario(robots=2)), 3.0):
-        payload = sample.payload
-        if sample.key == ch.FINAL_MAP.key():
-            final = decoded(payload, m.FusedMap)
-            means = floats(final.means, "means") * stretch
-            changed = msgspec.structs.replace(
-                final, diagnosis=(too_large,), means=from_floats(means)
-            )
-            payload = encoded(changed)
-        log.append(msgspec.structs.replace(sample, payload=payload))
-    run = evaluate(log)
+
+    def stretched(final: m.FusedMap) -> m.FusedMap:
+        means = from_floats(floats(final.means, "means") * stretch)
+        return replace(final, diagnosis=TOO_LARGE, means=means)
+
+    log = joined_log(without_starts(scenario(robots=2)), 3.0)
+    run = evaluate(changed(log, ch.FINAL_MAP, stretched))
     assert run.arbitrary_frame
     assert run.map.errors.nees_per_dof > 100.0
-    assert run.map.diagnosis == ((too_large,) if is_shown else ())
+    assert run.map.diagnosis == (TOO_LARGE if is_shown else ())
 
 
 def test_the_json_has_no_unaligned_figure_of_an_arbitrary_frame():
@@ -246,7 +236,7 @@ def test_the_own_pose_counts_only_where_there_is_no_team_pose():
 def test_damaged_messages_are_counted_and_left_out():
     log = joined_log(scenario(), 0.1)
     damaged = [
-        msgspec.structs.replace(s, payload=s.payload[:-3])
+        replace(s, payload=s.payload[:-3])
         if s.key in (ch.FINAL_MAP.key(), ch.START.key("r1"))
         else s
         for s in log
@@ -307,9 +297,7 @@ def test_what_a_driver_never_got_is_a_note():
 UNNAMED_IDS = [2**31 + k for k in range(9)]
 
 
-def unnamed_log(
-    means: np.ndarray, *, initial_poses: bool = True, named: int = 0, labels: bool = False
-) -> list[Sample]:
+def unnamed_log(means: np.ndarray, *, named: int = 0, labels: bool = False) -> list[Sample]:
     """A world whose final map has landmarks without identities, the first `named` excepted."""
     of = scenario()
     world = streams(of)
@@ -324,21 +312,7 @@ def unnamed_log(
             labels=from_ids([m.NO_LABEL]),
         )
         said.append(Outgoing(ch.TRUTH_LABELS, "r1", unknown))
-    log = world_log(of)
-    if not initial_poses:
-        log = [each for each in log if each.key != ch.START.key("r1")]
-        poses = world.streams[0].truth
-        stamps_ns = world.streams[0].intervals.end_ns
-        turned = np.column_stack(
-            (transform_points(ROTATED, poses[1:, :2]), poses[1:, 2] + ROTATED[2])
-        )
-        said.append(trajectory("r1", stamps_ns.tolist(), turned, 0.1))
-        unknown_start = build.initial_pose()
-        said.append(Outgoing(ch.START, "r1", unknown_start))
-    return log + samples(said)
-
-
-ROTATED = np.array([30.0, -20.0, 2.0])
+    return world_log(of) + samples(said)
 
 
 @pytest.mark.parametrize(("named", "labels"), [(0, False), (3, False), (0, True)])

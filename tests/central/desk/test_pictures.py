@@ -38,8 +38,6 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded
 from tests.sim.logs import joined_log, scenario, without_starts
 
-PNG = b"\x89PNG\r\n\x1a\n"
-
 
 @pytest.fixture(scope="module")
 def run():
@@ -70,13 +68,6 @@ def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed):
     assert np.abs(np.linalg.norm(drawn, axis=1) - abs(radius)).max() < 0.01 * abs(radius)
     on_the_spot = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 3.0], [0.01, 0.0, 0.1]])
     assert curve_through(on_the_spot).tolist() == on_the_spot[:, :2].tolist()
-
-
-def test_both_pictures_are_drawn(run, tmp_path):
-    assert map_picture(run, tmp_path / "map.png")
-    assert error_picture(run, tmp_path / "errors.png")
-    assert (tmp_path / "map.png").read_bytes().startswith(PNG)
-    assert (tmp_path / "errors.png").read_bytes().startswith(PNG)
 
 
 def test_the_same_run_draws_the_same_bytes(run, tmp_path):

@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from dataclasses import replace
 
 import msgspec
@@ -20,6 +19,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests.central.test_withdrawal import run, scenario
+from tests.sim.reruns import changed
 
 
 @pytest.fixture(scope="module")
@@ -54,28 +54,19 @@ def test_the_tables_the_page_and_the_figures_name_a_withdrawn_robot_by_whom_and_
 def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothing_is_named(
     samples,
 ):
-    def changed(final: m.FusedMap) -> m.FusedMap:
+    def of_r2(final: m.FusedMap) -> m.FusedMap:
         why = ("r2 (incarnation 1) not joined: 0 shared landmarks, 2 needed",)
         members = tuple(each for each in final.members if each.robot != "r1")
         return msgspec.structs.replace(
             final, reasons=why, members=members, lost=("r3",), withdrawn=()
         )
 
-    result = evaluate(with_final(samples, changed))
+    result = evaluate(changed(samples, ch.FINAL_MAP, of_r2))
     assert {name: of.state for name, of in result.states.items()} == {
         "r1": "not joined", "r2": "not joined", "r3": "lost",
     }  # fmt: skip
     assert result.states["r1"].why == "nothing of it is in the map"
     assert result.states["r2"].why == "0 shared landmarks, 2 needed"
-
-
-def with_final(samples: list[Sample], change: Callable[[m.FusedMap], m.FusedMap]) -> list[Sample]:
-    return [
-        msgspec.structs.replace(s, payload=encoded(change(decoded(s.payload, m.FusedMap))))
-        if s.key == ch.FINAL_MAP.key()
-        else s
-        for s in samples
-    ]
 
 
 def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed():
@@ -91,7 +82,7 @@ def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_prin
         withdrawn=("r1",),
         members=tuple(each for each in final.members if each.robot != "r1"),
     )
-    told = [*with_final(wrong, lambda _: gone)]
+    told = changed(wrong, ch.FINAL_MAP, lambda _: gone)
     told.append(Sample(ch.ORDER.key("r1"), encoded(order), 0, 0, 0))
     result = evaluate(told)
     assert result.arbitrary_frame

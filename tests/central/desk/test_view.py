@@ -132,9 +132,6 @@ def test_views_of_the_same_log_are_the_same_bytes(samples):
     assert list(with_views(samples)) == list(with_views(samples))
 
 
-# Drawings.
-
-
 # Errors.
 
 

@@ -6,11 +6,6 @@ from teamslam.team import core
 from teamslam.team.estimation.models import Noise
 
 STILL = np.zeros(3), np.zeros((3, 3))
-NO_MAP = np.empty(0, np.uint32), np.empty((1, 0, 2)), np.empty((1, 0, 3))
-
-
-def placed(pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray]:
-    return _stepped(pose, NO_MAP, seen, sensor, own)[:2]
 
 
 def updated(mean, packed, pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray, float]:

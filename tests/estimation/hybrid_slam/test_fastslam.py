@@ -9,6 +9,7 @@ from teamslam.team.core import moments
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.models import Increment, Noise
 from teamslam.team.estimation.scans import unclaimed
+from tests.estimation.submap_world import wrap
 
 quick = settings(deadline=None, max_examples=60)
 SENSOR = Sensor(range_sigma=0.1, range_sigma_per_m=0.001, bearing_sigma=0.002)
@@ -17,10 +18,6 @@ IDS = np.array([7, 3, 5], np.uint32)
 STANDING = Increment.identity()
 MOTION = Increment(np.array([1.0, 0.2, 0.1]), np.diag([0.05, 0.03, 0.004]) ** 2)
 RANK_TWO = np.array([[0.05, 0.0], [0.0, 0.03], [0.0, 0.004]])
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def observed(state, k):

@@ -4,16 +4,15 @@ import pytest
 from teamslam.sim.calibration.data import messages_of
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.team import core, translate
+from teamslam.team import translate
 from teamslam.team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
-from teamslam.team.core import landmarks_along_paths
 from teamslam.team.estimation.hybrid_slam import open_window
 from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
 from teamslam.team.estimation.hybrid_slam.window import gaussian
-from teamslam.team.estimation.models import Increment, Noise, predicted
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.scans import unclaimed
 from teamslam.team.estimation.se2 import between, compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
@@ -130,57 +129,6 @@ def test_its_covariance_is_what_the_truth_is_off_by():
         error = local.mean[:3] - true
         found.append(float(error @ np.linalg.solve(local.covariance[:3, :3], error)) / 3.0)
     assert np.mean(found) < 2.0  # of 24 numbers, once in a thousand
-
-
-PATH = np.array([[0.0, 0.0, 0.1], [0.5, 0.2, 0.3], [1.1, 0.3, -0.2], [1.4, 0.9, 0.5]])
-LANDMARK = np.array([4.0, 2.5])
-IDS = np.array([7], np.uint32)
-
-
-def measurements(rng: np.random.Generator) -> np.ndarray:
-    seen = np.array([predicted(pose, LANDMARK) for pose in PATH])
-    return seen + rng.normal(size=(4, 2)) * [0.05, 0.01] + rng.normal(size=2) * [0.1, 0.02]
-
-
-def dense(noise: Noise, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Generalised least squares with the full correlation matrix of the window's measurements."""
-    n = len(PATH)
-    shared = np.ones((n, n))
-    R = np.zeros((2 * n, 2 * n))
-    r, b = noise.range_variance, noise.bearing_variance
-    R[::2, ::2] = r * (noise.range_white * np.eye(n) + (1 - noise.range_white) * shared)
-    R[1::2, 1::2] = b * (noise.bearing_white * np.eye(n) + (1 - noise.bearing_white) * shared)
-    W = np.linalg.inv(R)
-    point = LANDMARK.copy()
-    for _ in range(20):
-        expected = [predicted(pose, point) for pose in PATH]
-        H = np.vstack([core.predict(pose, point[None])[2][0] for pose in PATH])
-        information = H.T @ W @ H
-        point = point + np.linalg.solve(information, H.T @ W @ (seen - expected).ravel())
-    return point, np.linalg.inv(information)
-
-
-@pytest.mark.parametrize(("range_white", "bearing_white"), [(1.0, 1.0), (0.2, 0.5), (1.0, 0.3)])
-def test_a_constant_error_within_a_window_equals_least_squares_with_its_correlation_matrix(
-    range_white, bearing_white
-):
-    noise = Noise(0.0125, 0.0, range_white, 5e-4, bearing_white)
-    seen = measurements(np.random.default_rng(3))
-    means, covariances = landmarks_along_paths(
-        IDS,
-        LANDMARK.reshape(1, 1, 2) + 0.05,
-        np.array([[[1.0, 0.0, 1.0]]]),
-        PATH[:, None, :],
-        np.arange(4),
-        IDS.repeat(4),
-        seen,
-        unclaimed(4),
-        noise,
-    )
-    point, covariance = dense(noise, seen)
-    np.testing.assert_allclose(means[0, 0], point, atol=1e-4)
-    expected = covariance[[0, 0, 1], [0, 1, 1]]
-    np.testing.assert_allclose(covariances[0, 0], expected, rtol=2e-3, atol=1e-7)
 
 
 SEEDS = 8

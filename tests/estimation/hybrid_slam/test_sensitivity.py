@@ -326,8 +326,3 @@ def test_biases_stay_when_islands_merge():
         for robot in ("r0", "r1")
         for bias in ("bearing", "range_scale")
     }
-
-
-# --- a simulated team with a biased camera ---
-
-BEARING, RANGE = 0.01, 0.01

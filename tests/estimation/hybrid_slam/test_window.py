@@ -16,6 +16,7 @@ from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.models import Increment, increment_of
 from teamslam.team.estimation.randomness import random_numbers
+from tests.estimation.submap_world import wrap
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
 ROBOT = MotionModel(
@@ -26,10 +27,6 @@ ROBOT = MotionModel(
 ACCURATE = Sensor(range_sigma=0.2, bearing_sigma=np.deg2rad(2.0))
 COARSE = Sensor(range_sigma=2.0, bearing_sigma=np.deg2rad(10.0))
 NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @dataclasses.dataclass

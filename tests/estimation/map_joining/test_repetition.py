@@ -17,7 +17,6 @@ from teamslam.team.estimation.map_joining.distinctness import (
     log_by_chance,
 )
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
-from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.association.unnamed_worlds import circle, drive
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
@@ -105,8 +104,3 @@ def test_nothing_is_said_of_a_robot_that_explores_and_comes_back(seed):
     submaps, _ = drive("r1", path, world, rng, reach=7.0)
     fold = folded(submaps)
     assert find_repetitions(fold.main, fold.main.graph.landmarks) == []
-
-
-def submap(sequence: int) -> Contribution:
-    local = LocalMap(np.zeros(0, np.uint32), np.zeros(3), np.eye(3))
-    return Contribution("r1", 3, sequence, 10 * (sequence + 1), local)

@@ -114,13 +114,3 @@ def test_hidden_detections_have_the_covariances_of_their_range_and_bearing(form)
     np.testing.assert_allclose(
         rb * seen.ranges, c * s * (yy - xx) + (c * c - s * s) * xy, atol=1e-9
     )
-
-
-ROBOT = RobotConfig("r1")
-
-
-def landmarks(**fields) -> np.ndarray:
-    world = SimulatedWorld(steps=1, size_m=30.0, **fields)
-    found = simulate(world, (ROBOT,), 3).landmarks
-    assert found is not None
-    return found

@@ -6,7 +6,6 @@ from scipy.stats import chi2
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.rules.team_keyframes import TeamKeyframes
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import WorldStreams
@@ -15,7 +14,6 @@ from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.se2 import compose, inverse, logarithm
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
-from tests import build
 from tests.final_maps import final_only
 from tests.teams import driven, published
 
@@ -144,17 +142,3 @@ def submaps_of(robot: RobotConfig, world: WorldStreams) -> list[m.Submap]:
 
 def cost_per_dof(of: m.FusedMap) -> float:
     return of.chi2 / of.dof
-
-
-def team_keyframes(robot: RobotConfig, world: WorldStreams) -> list[tuple[int, bytes, bytes]]:
-    keyframes = TeamKeyframes([robot.id])
-    keyframes.configure(robot.id, robot)
-    measurements = published(world.streams[0])
-    for measurement in measurements:
-        keyframes.put(measurement)
-    keyframes.end(build.end(**{robot.id: len(measurements)}))
-    return [
-        (each.stamp_ns, each.keyframe.increment.mean.tobytes(), each.keyframe.ranges.tobytes())
-        for step in keyframes.steps()
-        for each in step
-    ]

@@ -1,11 +1,10 @@
 import numpy as np
-from hypothesis import strategies as st
 
 from teamslam.sim.studies.estimators import dead_reckoning
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees
-from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.se2 import between, compose, exponential, logarithm
 
 MOTION = MotionModel(
@@ -13,13 +12,6 @@ MOTION = MotionModel(
 )
 SENSOR = Sensor()
 START = np.array([3.0, -2.0, 2.5])
-noise = st.floats(-0.3, 0.3)
-component = st.floats(-2.0, 2.0)
-increments = st.builds(
-    lambda mean, root: Increment(np.array(mean), np.array(root) @ np.array(root).T),
-    st.tuples(component, component, component),
-    st.lists(st.tuples(noise, noise, noise), min_size=3, max_size=3),
-)
 
 
 def reckoned(steps, start=START, measurements=()):

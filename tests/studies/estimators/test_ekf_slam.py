@@ -15,16 +15,12 @@ from teamslam.team.estimation.consistency import chi2_interval, nees, state_erro
 from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
+from tests.estimation.submap_world import wrap
 
 SENSOR = Sensor(range_sigma=0.2, range_sigma_per_m=0.01, bearing_sigma=0.03)
 STANDING = Increment.identity()
-NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
 quick = settings(deadline=None, max_examples=40)
 seeds = st.integers(0, 2**32 - 1)
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def observed(x, slot):

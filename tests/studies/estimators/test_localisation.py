@@ -12,16 +12,13 @@ from teamslam.team.estimation.consistency import chi2_interval, nees, state_erro
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
+from tests.estimation.submap_world import wrap
 
 IDS = np.array([2, 5, 9], np.uint32)
 LANDMARKS = np.array([[9.0, 2.0], [-4.0, 7.0], [1.0, -8.0]])
 SENSOR = Sensor(range_sigma=0.8, range_sigma_per_m=0.02, bearing_sigma=0.15)
 MOTION = Increment(np.array([1.0, 0.1, 0.2]), np.diag([0.1, 0.05, 0.05]) ** 2)
 STANDING = Increment.identity()
-
-
-def wrap(angle):
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def sights(pose, landmarks=LANDMARKS):
