@@ -33,6 +33,7 @@ from teamslam.team.estimation.association.voting import (
 from teamslam.team.estimation.contribution import Stream, is_map
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.late_seams import MOST_ABSENT, weigh_places
 from teamslam.team.estimation.map_joining.memory import MOST
 from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
 from teamslam.team.shapes import Bool, Float, Int64
@@ -130,10 +131,10 @@ class OdometryTie(NamedTuple):
 def find_odometry_ties(
     island: Island, shown: Collection[int], undecided: Collection[int] = ()
 ) -> list[OdometryTie]:
-    """Find the place of each stream with the most landmarks on both sides, of which one at least is
-    shown: the others may be the same landmarks twice.
+    """Find the place of each stream, with a shown landmark on both sides, that its misses of
+    landmarks speak against most, and at least as much as one beyond doubt (`late_seams`).
 
-    An error of the odometry there beyond its covariance contradicts nothing.
+    Without such misses the odometry there is as right as its covariance states.
     """
     unnamed = sorted(node for id_, node in island.graph.landmarks.items() if id_ >= UNNAMED)
     sees = _tabulate(island, unnamed)
@@ -146,19 +147,20 @@ def find_odometry_ties(
     for stream in sorted(island.graph.streams):
         rows = [k for k, each in enumerate(submaps) if each.contribution.stream == stream]
         elsewhere = np.delete(sees, rows, axis=0).any(axis=0)
-        best: tuple[int, int, int, int] | None = None
+        places: list[tuple[int, int, int]] = []
         for k in range(1, len(rows)):
             rest = elsewhere | sees[rows[:k]].any(axis=0)
             beyond = sees[rows[k:]].any(axis=0)
             counts = int((rest & counted).sum()), int((beyond & counted).sum())
-            least = min(counts)
             if (rest & beyond).any() or not ((rest & is_shown).any() and (beyond & is_shown).any()):
                 continue
-            if least >= LEAST_TIED and (not best or least > best[0]):
-                best = least, k, *counts
-        if best is None:
+            if min(counts) >= LEAST_TIED:
+                places.append((k, *counts))
+        firsts = [(stream, submaps[rows[k]].contribution.sequence) for k, *_ in places]
+        evidence = weigh_places(island, firsts)
+        if max(evidence, default=0.0) < MOST_ABSENT:
             continue
-        _, k, earlier, later = best
+        k, earlier, later = places[int(np.argmax(evidence))]
         before, submap = (submaps[rows[at]].contribution for at in (k - 1, k))
         _, P = joint_marginal(island, [int(submaps[rows[k]].nodes[0])])
         found.append(

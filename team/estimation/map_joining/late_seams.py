@@ -14,7 +14,7 @@ over the uncertainty of d.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -213,7 +213,6 @@ def _list_places(
     sights: _Sights, rows: list[int], misses: Misses, possible: Bool[np.ndarray, "n n"]
 ) -> Iterator[_Place]:
     """List the candidates of a stream in the order of time: between two submaps, or inside one."""
-    stable = sights.counts >= LEAST_COUNT
     for k in range(LEAST_BEFORE, len(rows)):
         before, row = rows[k - 1], rows[k]
         for after in (k, k + 1):
@@ -224,23 +223,54 @@ def _list_places(
             )
             if after == len(rows) or tracked > MOST_TRACKED:
                 continue
-            behind = np.zeros(len(sights.submaps), np.bool_)
-            behind[rows[after:]] = True
-            ahead = ~behind
-            ahead[rows[k:after]] = False
-            one, two = sights.sees[ahead].any(axis=0), sights.sees[behind].any(axis=0)
-            common = int((one & two).sum())
-            sides: list[float] = []
-            fresh = 0
-            for own, other, by in ((one, two, behind), (two, one, ahead)):
-                alone = own & ~other & stable & ~possible[:, other].any(axis=1)
-                missed = np.minimum(misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT)
-                sides.append(float(missed.sum()))
-                fresh = int(alone.sum())
+            sides, common, fresh = _weigh_place(sights, rows, (k, after), misses, possible)
             if common > MOST_COMMON or fresh <= common or min(sides) < MOST_ABSENT:
                 continue
             evidence = sum(sides) - PRESENT * float(common)
             yield _Place(before, rows[after], evidence)
+
+
+def weigh_places(island: Island, places: Sequence[tuple[Stream, int]]) -> list[float]:
+    """Compute the evidence of a stream elsewhere from a submap on, for places (stream, sequence)
+    with no landmark on both sides.
+    """
+    if not places:
+        return []
+    sights = _sights_of(island)
+    spread, possible = _uncertainty_of(island, sights)
+    misses, found = _misses(sights, spread), []
+    for stream, first in places:
+        rows = _rows_of(sights, stream)
+        k = [sights.submaps[row].contribution.sequence for row in rows].index(first)
+        sides, _, _ = _weigh_place(sights, rows, (k, k), misses, possible)
+        found.append(sum(sides))
+    return found
+
+
+def _weigh_place(
+    sights: _Sights,
+    rows: list[int],
+    place: tuple[int, int],
+    misses: Misses,
+    possible: Bool[np.ndarray, "n n"],
+) -> tuple[list[float], int, int]:
+    """Compute the evidence of each side of a place (k, after), the number of landmarks of both, and
+    of those that only the stream's submaps `rows[after:]` have; rows[k:after] is on no side.
+    """
+    stable = sights.counts >= LEAST_COUNT
+    behind = np.zeros(len(sights.submaps), np.bool_)
+    behind[rows[place[1] :]] = True
+    ahead = ~behind
+    ahead[rows[slice(*place)]] = False
+    one, two = sights.sees[ahead].any(axis=0), sights.sees[behind].any(axis=0)
+    sides: list[float] = []
+    fresh = 0
+    for own, other, by in ((one, two, behind), (two, one, ahead)):
+        alone = own & ~other & stable & ~possible[:, other].any(axis=1)
+        missed = np.minimum(misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT)
+        sides.append(float(missed.sum()))
+        fresh = int(alone.sum())
+    return sides, int((one & two).sum()), fresh
 
 
 def _least_tracked(submap: Joined) -> int:
