@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks.baseline import conclude
 from teamslam.sim.launch.launch import Plan, launch
-from teamslam.sim.launch.processes import PROGRAM, Starter
+from teamslam.sim.launch.processes import PROGRAM
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire.channels import SENSORS
@@ -39,7 +39,7 @@ def launch_team(scenario: Scenario, folder: Path) -> dict[str, Any]:
         listen="tcp/127.0.0.1:0",
         views=False,
     )
-    outcome = launch(plan, Starter(time.time_ns()), lambda watch: None)
+    outcome = launch(plan, lambda watch: None)
     assert outcome.failures == [], outcome.failures
     robots = [used for name, used in outcome.used.items() if name.startswith("robot-")]
     return {

@@ -1,9 +1,8 @@
 """Calibrate odometry and sensor models from measurements.
 
-With truth every figure is a maximum-likelihood estimate. Without truth the reference is the joined
-map and its paths, in alternation (expectation and maximisation); only odometry scales, drag and
-veer, and the clocks of detections against odometry are calibrated, since a team cannot observe the
-scale of its own ranges. The join trusts odometry less, so that ranges set the scale.
+With truth every figure is a maximum-likelihood estimate. Without truth the joined map is the
+reference, in alternation; a team cannot observe the scale of its own ranges, so only odometry
+scales, drag, veer and clocks are calibrated, and the join trusts odometry less.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -62,9 +61,9 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibrated figures by part of a robot's configuration, and notes.
+    """Calibrated figures by part of a configuration.
 
-    clocks: `clock_offset_s` of every robot with enough measurements, if one's clocks differ.
+    clocks: `clock_offset_s` of every robot if one's clocks differ.
     """
 
     motion: tuple[Figure, ...]
@@ -81,9 +80,8 @@ class Calibration:
 def calibrate_models(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
-    """Calibrate from all worlds (label, streams) together, starting from the scenario's models.
-
-    Raises CalibrationError for insufficient measurements.
+    """Calibrate from all worlds (label, streams), starting from the scenario's models; raises
+    CalibrationError.
     """
     stretches = moving_stretches(stream for _, world in worlds for stream in world.streams)
     if stretches < LEAST_SPANS:
@@ -165,7 +163,7 @@ def _clock_figures(found: Mapping[str, clocks.Clock], scenario: Scenario) -> Map
 def _align_clocks_by_map(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> tuple[Sequence[tuple[str, WorldStreams]], Mapping[str, clocks.Clock]]:
-    """Move each robot's detections to its odometry's clock; returns worlds and clocks."""
+    """Move each robot's detections to its odometry's clock."""
     robots = sorted({stream.robot for _, world in worlds for stream in world.streams})
     moved, total = dict.fromkeys(robots, 0.0), {}
     for turn in range(CLOCK_ROUNDS):
@@ -255,7 +253,6 @@ def _calibrate_by_map(
 def _fit_factor_by_cost(
     team: JoinedTeam, central: CentralConfig, progress: Progress
 ) -> tuple[Figure, ...]:
-    """Covariance factor for too few robots to compare; unnamed landmarks only."""
     if not any(len(each.local.unnamed.counts) for each in team.contributions):
         return ()
     progress("the map under other covariance factors")

@@ -1,8 +1,8 @@
 """Compare measurement covariances and the sensor mount with the truth.
 
-A factor is the median squared Mahalanobis error over the median of chi-square. Odometry errors are
-taken over spans, since the reference's own error dominates single intervals. Mount heading and
-`bearing_offset` have the same effect: only their sum is observable.
+A factor is the median squared Mahalanobis error over the median of chi-square, for odometry over
+spans, since the reference's own error dominates single intervals. Of mount heading and
+`bearing_offset` only the sum is observable.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ UNITS = {"covariance_factor": ""}
 
 
 def odometry_factor(data: Sequence[Reference]) -> Mapping[str, float]:
-    """`motion.covariance_factor` of increments with covariances; empty if too few."""
+    """`motion.covariance_factor`; empty for too few increments."""
     squared = [value for each in data for value in _spans(each)]
     return _factor(np.array(squared), 3)
 
@@ -58,7 +58,7 @@ def _spans(data: Reference) -> list[float]:
 
 
 def landmark_factor(data: Sequence[Reference], sensor: Sensor) -> Mapping[str, float]:
-    """`sensor.covariance_factor` of landmark measurements; empty if too few."""
+    """`sensor.covariance_factor`; empty for too few measurements."""
     parts = [np.empty(0)]
     for each in data:
         claims = each.seen.covariances
@@ -81,7 +81,7 @@ def _factor(squared: Float[np.ndarray, " n"], dof: int) -> Mapping[str, float]:
 
 
 class _Rows(NamedTuple):
-    """Measurements of known landmarks and true values, in the sensor frame."""
+    """Measurements of known landmarks, in the sensor frame."""
 
     taken: np.ndarray
     ranges: Float[np.ndarray, " n"]
@@ -108,9 +108,7 @@ def _rows(data: Reference, sensor: Sensor) -> _Rows:
 def measured_and_true(
     data: Reference, sensor: Sensor
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]:
-    """Mask of detections of known landmarks from known poses; measured and true points [m] in the
-    sensor frame.
-    """
+    """Mask of usable detections; measured and true points [m] in the sensor frame."""
     rows = _rows(data, sensor)
     points, true = (np.full((len(rows.taken), 2), np.nan) for _ in range(2))
     points[rows.taken], true[rows.taken] = rows.points, rows.true_points
@@ -118,7 +116,7 @@ def measured_and_true(
 
 
 def mount_note(data: Sequence[Reference], sensor: Sensor) -> tuple[str, ...]:
-    """Note on a sensor mount that deviates from the scenario's."""
+    """Note on a mount that deviates from the scenario's."""
     rows = [_rows(each, sensor) for each in data]
     points = np.concatenate([np.empty((0, 2)), *(each.points for each in rows)])
     true = np.concatenate([np.empty((0, 2)), *(each.true_points for each in rows)])

@@ -2,8 +2,7 @@
 
 A detection stamped t was made at t − τ. In straight motion τ looks like a mount moved forward by v
 τ, so mount pose and range offset are estimated jointly. Odometry is compared with the path's turn,
-with free scale. Without a path the centre's bias `clock_offset` is the measure (`clock_of_map`).
-`RobotConfig.clock_offset_s` is τ of the detections less that of the odometry.
+with free scale. `RobotConfig.clock_offset_s` is τ of the detections less that of the odometry.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +37,7 @@ UNITS = {"detections": "s", "odometry": "s", "clock_offset_s": "s"}
 
 @dataclass(frozen=True)
 class Clock:
-    """Delays of a robot's detections and odometry, and their difference."""
+    """Delays of detections and odometry, and their difference."""
 
     detections: Figure
     odometry: Figure
@@ -51,7 +50,7 @@ class Clock:
         return abs(found.value) > max(LEAST_S, BEYOND_DOUBT * found.sigma)
 
     def later(self, seconds: float) -> "Clock":
-        """Add the time [s] by which the detections were moved before this estimate."""
+        """Add the time [s] by which detections were moved before."""
         delay, offset = (
             replace(each, value=each.value + seconds)
             for each in (self.detections, self.clock_offset_s)
@@ -60,9 +59,8 @@ class Clock:
 
 
 def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
-    """Clocks of each robot with enough measurements on a known path.
-
-    Excludes robots that turn before driving, whose speeds are unknown.
+    """Clocks of robots with enough measurements on a known path; a robot that turns before driving
+    has unknown speeds.
     """
     found = {}
     for robot, own in sorted(by_robot([each for each in data if not each.turns_first]).items()):
@@ -73,7 +71,7 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
 
 
 def clock_of_map(robot: str, folds: Sequence[Fold]) -> Clock | None:
-    """Clock of a robot by the joined maps of all worlds; None where it is no state."""
+    """Clock by the biases of joined maps; None where it is no state."""
     found = [
         (each.value, each.sigma)
         for fold in folds
@@ -102,7 +100,7 @@ def clock_notes(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
 
 
 def on_one_clock(world: WorldStreams, clocks: Mapping[str, Clock]) -> WorldStreams:
-    """Move odometry and detections of robots with an offset to the path's clock."""
+    """Move streams of robots with an offset to the path's clock."""
     streams = tuple(
         _move_detections(each, clocks[each.robot])
         if each.robot in clocks and clocks[each.robot].is_off
@@ -144,10 +142,7 @@ def _at(data: Reference, late_ns: int) -> Reference:
 
 
 def _settle_time(step_at: Callable[[int], float | None]) -> float | None:
-    """Add steps to a time [s] until one is below SETTLED_S; None if beyond LARGEST_S.
-
-    step_at: further time [s] at a time [ns], or None if undetermined.
-    """
+    """Sum of steps [s], until one is below SETTLED_S; None beyond LARGEST_S."""
     late = 0.0
     for _ in range(ROUNDS):
         step = step_at(round(late * 1e9))
@@ -160,10 +155,7 @@ def _settle_time(step_at: Callable[[int], float | None]) -> float | None:
 
 
 def _detections_late(data: Sequence[Reference], sensor: Sensor) -> float | None:
-    """Delay of the detections [s], or None.
-
-    Iterated linear fit of (mount x, y, θ, range offset, τ) under Huber's loss.
-    """
+    """Delay [s]: iterated linear fit of (mount x, y, θ, range offset, τ) under Huber's loss."""
 
     def step_at(late_ns: int) -> float | None:
         here, before, after = (
@@ -235,9 +227,7 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
 def _turns(
     data: Reference, late_ns: int
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Logged turn of each interval, turn of the path moved by late_ns, and its derivative
-    [rad, rad, rad/s].
-    """
+    """Logged turn, turn of the path moved by late_ns, its derivative [rad, rad, rad/s]."""
     intervals = data.intervals
 
     def turned(by_ns: int) -> tuple[Float[np.ndarray, " n"], np.ndarray]:

@@ -60,9 +60,7 @@ def central_figures(
     progress: Callable[[str], None],
     true_landmarks: Sequence[Mapping[int, Float[np.ndarray, "2"]]] = (),
 ) -> tuple[Figure, ...]:
-    """Standard deviations of robots' own biases, covariance factor, monitor's normal scale, and
-    landmark sigma from the true landmarks of each world.
-    """
+    """Robots' own biases, covariance factor, monitor's normal scale, and landmark sigma."""
     progress("maps of single robots against the rest of their team")
     fields = nest_figures(msgspec.to_builtins(scenario.central), strays, CentralConfig)
     for table in ("bias_sigma", "common_bias_sigma"):
@@ -81,10 +79,7 @@ def central_figures(
 
 
 def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """Factor, at least 1, that gives ΣD its expected value; σ from the scatter over robots.
-
-    None below LEAST_ROBOTS.
-    """
+    """Factor, at least 1, that gives ΣD its expected value; None below LEAST_ROBOTS."""
     settings = join_settings(central)
     factor = settings.covariance_factor
     for _ in range(MOST_ROUNDS):
@@ -104,10 +99,9 @@ def covariance_factor(teams: Sequence[Fold], central: CentralConfig) -> Figure |
 def factor_by_cost(
     refold: Callable[[CentralConfig], Fold], central: CentralConfig
 ) -> Figure | None:
-    """Factor, at least 1, that makes the joint cost equal its degrees of freedom; σ from χ².
+    """Factor, at least 1, at which the joint cost equals its degrees of freedom; σ from χ².
 
-    It covers only errors that differ between windows. Landmarks are associated anew under each
-    factor. None without degrees of freedom.
+    Covers errors that differ between windows only. Landmarks are associated anew for each factor.
     """
     factor = central.covariance_factor
     for _ in range(MOST_ROUNDS):
@@ -124,10 +118,10 @@ def factor_by_cost(
 def landmark_sigma(
     teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
 ) -> Figure | None:
-    """σ [m] that explains the joined maps' shape errors: Σ χ²(σ) = Σ dof with P + σ² I.
+    """σ [m] with Σ χ²(σ) = Σ dof of the maps' shape errors, for P + σ² I.
 
-    teams: fold and true landmarks of each world. Standard deviation: half the range of Σ χ² = Σ dof
-    ± √(2 Σ dof). None without a shape; 0 if P suffices.
+    Standard deviation: half the range of Σ χ² = Σ dof ± √(2 Σ dof). None without a shape; 0 if P
+    suffices.
     """
     settings = replace(join_settings(central), landmark_sigma=0.0)
     maps = []
@@ -166,9 +160,9 @@ def _shape_chi2(
 
 
 def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """Monitor's covariance scale for consistent data: geometric mean over the worlds.
+    """Covariance scale of consistent data: geometric mean over the worlds.
 
-    Standard deviation from their scatter, or the monitor's for one. None for too few submaps.
+    Standard deviation from their scatter, or the monitor's for one.
     """
     settings = join_settings(central)
     scales, sigmas = [], []
@@ -190,7 +184,7 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
-    """D of each main-island robot with at least LEAST_LANDMARKS in common with the others."""
+    """D of each robot with at least LEAST_LANDMARKS in common with the others."""
     island = fold.main
     robots = sorted({robot for robot, _ in island.graph.streams})
     found = []
@@ -206,9 +200,8 @@ def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
 def _separate_robot(
     island: Island, robot: str, starts: Mapping[Stream, InitialPoseFactor], settings: JoinSettings
 ) -> tuple[Graph, Island]:
-    """Graph of one robot's map beside the others', its landmarks numbered from APART.
-
-    It starts from the joined solution and shares the states of team-wide biases.
+    """One robot's map beside the others', its landmarks numbered from APART, from the joined
+    solution.
     """
     submaps = island.graph.submaps
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
@@ -241,7 +234,7 @@ def _separate_robot(
 def _compare_maps(
     mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]
 ) -> Disagreement:
-    """D of two maps of n landmarks, from stacked means and joint covariance."""
+    """D, from stacked means and joint covariance."""
     a, b = mean.reshape(2, -1, 2)
     a_from_b = rigid_alignment(a, b)
     if a_from_b is None:

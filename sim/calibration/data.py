@@ -21,10 +21,10 @@ FASTEST_TURN_RAD_S = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """One robot's odometry and landmark measurements, with reference poses and landmarks.
+    """One robot's measurements, with reference poses and landmarks.
 
-    name: world label and robot id. gap_ns: longest interpolated gap of `path`. landmarks: in the
-    path's frame. turns_first: turn, then drive straight between poses, not an arc.
+    name: world label and robot id. gap_ns: longest interpolated gap of `path`. turns_first: turn,
+    then drive straight between poses, not an arc.
     """
 
     name: str
@@ -62,7 +62,7 @@ def by_robot(data: Sequence[Reference]) -> dict[str, list[Reference]]:
 def sensor_poses(
     data: Reference, stamps_ns: Int64[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, " n"]]:
-    """Sensor poses at these times, and a mask of known ones."""
+    """Sensor poses, and a mask of known ones."""
     poses, known = poses_at(data.path, stamps_ns, data.gap_ns, turns_first=data.turns_first)
     if not any(data.mount):
         return poses, known
@@ -73,7 +73,7 @@ def sensor_poses(
 
 
 class SeenLandmarks(NamedTuple):
-    """Detections of known landmarks from known sensor poses; chosen: mask of all."""
+    """Detections of known landmarks from known poses; chosen: mask of all."""
 
     chosen: Bool[np.ndarray, " N"]
     stamps_ns: Int64[np.ndarray, " n"]
@@ -82,7 +82,7 @@ class SeenLandmarks(NamedTuple):
 
 
 def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None) -> SeenLandmarks:
-    """Known landmarks among the detections; usable: further mask."""
+    """Known landmarks among the detections."""
     seen = data.seen
     stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
     poses, chosen = sensor_poses(data, stamps)
@@ -93,7 +93,7 @@ def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None
 
 
 def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
-    """Convert odometry of any form to mean speeds; increments as arcs."""
+    """Convert odometry to mean speeds, increments as arcs."""
     speeds = np.column_stack([intervals.forward, intervals.yaw_rate])
     if intervals.steered:
         speeds = np.array([steered(motion, *pair) for pair in speeds.tolist()]).reshape(-1, 2)
@@ -157,10 +157,7 @@ def references(
     turning_first: frozenset[str] = frozenset(),
     models: RobotConfig | None = None,
 ) -> list[Reference]:
-    """References of the robots with a path and odometry.
-
-    turning_first: robots that turn, then drive straight.
-    """
+    """References of the robots with a path and odometry."""
     robot = models or RobotConfig("any")
     return [
         Reference(
@@ -182,7 +179,7 @@ def references(
 
 
 def true_paths(streams: Sequence[RobotStream]) -> dict[str, Path]:
-    """True paths of the robots that have one."""
+    """True paths by robot."""
     return {
         stream.robot: Path(stream.truth_ns, stream.truth)
         for stream in streams
@@ -199,7 +196,7 @@ LEAST_WAY_M = 0.05
 
 
 def too_short(stretches: int) -> str:
-    """Error text for data with this number of moving stretches."""
+    """Error text for too few moving stretches."""
     return (
         f"calibrate needs {LEAST_SPANS} stretches of {SPAN_S:.0f} s with motion, of all robots "
         f"together, and these data have {stretches}: give several data sets at once, record "
@@ -209,7 +206,7 @@ def too_short(stretches: int) -> str:
 
 
 def moving_stretches(streams: Iterable[RobotStream]) -> int:
-    """Number of whole stretches of SPAN_S with moving odometry."""
+    """Number of stretches of SPAN_S with motion."""
     return sum(map(_count_moving, streams))
 
 

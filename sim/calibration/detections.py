@@ -50,10 +50,10 @@ UNITS = {
 
 
 class WindowLooks(NamedTuple):
-    """Repeated detections in the scans of one window.
+    """Repeated detections in a window.
 
     trials, again: per landmark, scans that cover its place after its first detection, and
-    detections among them. area [m²]: view area times scans. cost, dof: of the smoothed window.
+    detections among them. area [m²]: view area times scans.
     """
 
     trials: Int64[np.ndarray, " L"]
@@ -66,7 +66,7 @@ class WindowLooks(NamedTuple):
 
 
 def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
-    """A robot's solvable windows with detections without identities."""
+    """Solvable windows with detections without identities."""
     if stream.landmark_detections.hidden is None:
         return []
     front = config.front_end
@@ -101,7 +101,7 @@ def _looks(scans: Scans, settings: AssociationSettings) -> list[WindowLooks]:
 
 
 def looks_of(found: Clusters) -> WindowLooks:
-    """Trials and detections of each landmark of a window."""
+    """Trials and detections of each landmark."""
     scans, landmarks = found.scans, found.window.landmarks
     unnamed = found.names == UNASSIGNED
     trials = np.zeros(len(landmarks), np.int64)
@@ -143,8 +143,8 @@ def looks_of(found: Clusters) -> WindowLooks:
 
 
 class Rates(NamedTuple):
-    """detected: detection probability of a landmark in view. share: clutter share of detections.
-    density: clutter per scan and square metre of view. claimed: squared window errors over claims.
+    """detected: probability for a landmark in view. share: clutter among detections. density:
+    clutter per scan and m². claimed: squared window errors over claims.
     """
 
     detected: float
@@ -196,7 +196,7 @@ def _clutter(
 
 
 def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
-    """Rates of all windows, with uncertainty from leaving out stretches."""
+    """Rates of all windows, with jackknife uncertainty."""
     if len(windows) < GROUPS:
         return ()
     edges = np.linspace(0, len(windows), GROUPS + 1).astype(int)

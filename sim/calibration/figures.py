@@ -25,12 +25,12 @@ Fit = Callable[[Sequence[T]], Mapping[str, float]]
 
 
 class CalibrationError(ValueError):
-    """The data do not determine a figure; the text names the missing data."""
+    """The data do not determine a figure."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """Calibrated number: place in a scenario, value, standard deviation, unit."""
+    """Calibrated number, named by its place in a scenario."""
 
     name: str
     value: float
@@ -53,7 +53,7 @@ def huber(
 
 
 def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
-    """Most independent groups: robots of each data set, or stretches of each."""
+    """Robots of each data set; stretches of each if few."""
     pieces = -(-GROUPS // len(data))
     if pieces == 1:
         return [[each] for each in data]
@@ -68,7 +68,7 @@ def groups_of(data: Sequence[Reference]) -> list[list[Reference]]:
 def jackknife(
     fit: Fit[Reference], data: Sequence[Reference], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """Fit all data, with uncertainty over robots or time stretches."""
+    """Fit all data, with uncertainty over `groups_of`."""
     return leave_out_groups(fit, groups_of(data), units)
 
 
@@ -76,7 +76,7 @@ def leave_out_groups(
     fit: Fit[T], groups: Sequence[Sequence[T]], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
     """Fit all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)² (Efron and Stein
-    1981). Omits a figure that leaving out a group makes undetermined.
+    1981).
     """
     values = fit([part for group in groups for part in group])
     rest = [
@@ -103,7 +103,7 @@ def with_figures(
     of_sensor: Sequence[Figure],
     of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
 ) -> Scenario:
-    """Scenario with the figures in every robot's models; a robot's own take precedence."""
+    """Scenario with these figures; a robot's own take precedence."""
     robots = tuple(
         msgspec.structs.replace(
             robot,
@@ -127,10 +127,7 @@ def with_figures(
 def nest_figures(
     below: Mapping[str, object], figures: Sequence[Figure], declared: type[msgspec.Struct]
 ) -> dict[str, object]:
-    """Overlay a model's fields with figures: `forward.per_m` is a field of `forward`.
-
-    A density replaces all densities of its noise. Omits figures that are no field of the model.
-    """
+    """Overlay a model's fields: `forward.per_m` is a field of `forward`, and replaces all of it."""
     names = {field.name for field in msgspec.structs.fields(declared)}
     fields = dict(below)
     noises: dict[str, dict[str, float]] = {}

@@ -36,7 +36,7 @@ from teamslam.team.wire import messages as m
 
 @dataclass(frozen=True)
 class _Track:
-    """Closed window: submap, and mean particle path in its frame."""
+    """Closed window, and mean particle path in its frame."""
 
     closed: ClosedWindow
     stamps_ns: Int64[np.ndarray, " K"]
@@ -45,7 +45,7 @@ class _Track:
 
 @dataclass(frozen=True)
 class JoinedTeam:
-    """Landmarks by id and robot paths in the joined map's frame, and the fold."""
+    """Landmarks and paths in the joined map's frame."""
 
     landmarks: Mapping[int, Float[np.ndarray, "2"]]
     paths: Mapping[str, Path]
@@ -56,10 +56,10 @@ class JoinedTeam:
 def join_team(
     world: WorldStreams, scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> JoinedTeam:
-    """Join every robot's windows under the scenario's models; main island only.
+    """Join every robot's windows; main island only.
 
-    Between window ends a path is the particle mean, moved to end at the joined pose. progress
-    receives each finished robot. Raises CalibrationError without submaps.
+    Between window ends a path is the particle mean, moved to end at the joined pose. Raises
+    CalibrationError without submaps.
     """
     tracks = {}
     for each in world.streams:
@@ -99,7 +99,7 @@ def fold_of(
     starts: Iterable[InitialPoseFactor],
     central: CentralConfig,
 ) -> Fold:
-    """Solved fold of these submaps, with unnamed landmarks associated."""
+    """Solved fold, with unnamed landmarks associated."""
     fold: Fold = EMPTY_FOLD
     for start in starts:
         fold = add_start(fold, start)
@@ -118,7 +118,7 @@ def fold_of(
 
 
 def config_of(robot: str, scenario: Scenario) -> RobotConfig:
-    """Robot's configuration (the first robot's for an unknown one) without clock offset."""
+    """Configuration without clock offset; the first robot's for an unknown one."""
     configs = {each.id: each for each in scenario.robots}
     own = configs.get(robot, scenario.robots[0])
     return msgspec.structs.replace(own, id=robot, clock_offset_s=0.0)

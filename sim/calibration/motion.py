@@ -52,7 +52,7 @@ Values = Float[np.ndarray, " spans"]
 
 @dataclass(frozen=True)
 class _Spans:
-    """Steps of each span: logged mean speed and yaw rate; true forward, lateral and rotation."""
+    """Steps of each span: logged speed and yaw rate; true forward, lateral and rotation."""
 
     speed: Grid
     yaw_rate: Grid
@@ -131,18 +131,17 @@ def _steps_of(data: Reference) -> Float[np.ndarray, "spans steps 5"]:
 
 
 def creep(data: Sequence[Reference], slow_below: float) -> bool:
-    """Whether low speeds last long enough for their scale."""
+    """Whether slow motion lasts long enough for its scale."""
     return bool(_spans(data).slow(slow_below).sum() * STEP_S >= LEAST_SLOW_S)
 
 
 def fit_motion(
     data: Sequence[Reference], yaw_rate_limit: float | None, slow_below: float = 0.0
 ) -> Mapping[str, float]:
-    """Fit the model of `increment_of` with the likeliest errors over SPAN_S.
+    """Fit the model of `increment_of`, with errors over SPAN_S; raises CalibrationError.
 
     slow_below [m/s]: fit the scale below that speed, too. Alternates weighted least squares of the
-    scales under Huber's loss with the likelihood of residual densities σ² = per_m² |d| + per_rad²
-    |φ|. Raises CalibrationError for too little motion.
+    scales under Huber's loss with the likelihood of densities σ² = per_m² |d| + per_rad² |φ|.
     """
     spans = _spans(data)
     moving = np.abs(spans.speed).mean(axis=1) * SPAN_S > LEAST_WAY_M

@@ -33,8 +33,8 @@ BIAS_OF = {
 
 
 class Own(NamedTuple):
-    """robots: sensor figures of each robot, empty if alike. strays: σ of each bias in a further
-    world, √(s² + variance of the figure), and σ of the common range scale.
+    """robots: sensor figures of each, empty if alike. strays: σ of each bias in a further world,
+    √(s² + variance of the figure).
     """
 
     robots: Mapping[str, tuple[Figure, ...]]
@@ -45,7 +45,7 @@ NOTHING_OF_ITS_OWN = Own({}, ())
 
 
 def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
-    """Each robot's constants over the worlds, or time stretches."""
+    """Each robot's constants over worlds, or time stretches."""
     found: dict[str, list[Mapping[str, float]]] = {}
     covariances = []
     worlds: dict[str, list[str]] = {}
@@ -102,7 +102,6 @@ def _spread_in_robot(parts: Sequence[Float[np.ndarray, " n"]]) -> float:
 def _in_common(
     parts: Sequence[Float[np.ndarray, " n"]], worlds: Sequence[Sequence[str]], stray: float
 ) -> Figure:
-    """Standard deviation between worlds of the robots' common range scale."""
     off: dict[str, list[float]] = {}
     for part, names in zip(parts, worlds, strict=True):
         each_world = sorted({*names})
@@ -119,9 +118,8 @@ def _in_common(
 def marker_spread(data: Sequence[Reference], *, depth: bool) -> Figure | None:
     """Relative standard deviation of single landmarks' range scales, as of larger markers.
 
-    The share e_rl by which robot r sees landmark l too far, given r's constants, is m_l + ε_rl:
-    var(m) = var(ē_l) − var(ε) mean(1/n_l) of the n_l robots that see it. None if not significant (F
-    test), for few landmarks, or if no two robots share one.
+    The share e_rl by which robot r sees landmark l too far is m_l + ε_rl: var(m) = var(ē_l) −
+    var(ε) mean(1/n_l) of n_l robots. None if not significant (F test).
     """
     by_world: dict[str, dict[int, list[float]]] = {}
     for each in data:

@@ -23,7 +23,7 @@ Fields = dict[str, Any]
 def scenario_text(
     calibration: Calibration, start: Scenario, own: str | None, sources: Sequence[str], output: Path
 ) -> str:
-    """Text of `output`: the user's scenario `own`, or a built-in base, with the calibrated figures.
+    """Text of `output`: the user's scenario, or a built-in base, with the figures.
 
     Common figures replace all robots' values, except figures of single robots. All robots are named
     if one has figures of its own.
@@ -65,10 +65,7 @@ def scenario_text(
 
 
 def _document_of(scenario: Scenario, calibration: Calibration) -> Fields:
-    """Document whose `base` is the built-in scenario's name, or the data set's.
-
-    It names robots of a live team, and robots with figures or sensors of their own.
-    """
+    """Document with a built-in base; it names robots of a live team or with own figures."""
     world = scenario.world
     otherwise = "recorded" if isinstance(world, FolderWorld | LiveWorld) else "utias"
     base = scenario.name if scenario.name in builtin_names() else otherwise

@@ -1,7 +1,7 @@
 """Maximum-likelihood range-bearing model: affine range, noise and correlation time.
 
 For a depth along the optical axis, range = scale · distance · cos(b − axis) + offset with raw
-bearing b. Each robot's constants are fitted, and those of all together for unknown robots.
+bearing b.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,9 +57,9 @@ UNITS = {
 
 @dataclass(frozen=True)
 class _Rows:
-    """Measurements with true distances [m] and bearings [rad].
+    """True distances [m] and bearing errors [rad]; rows ascend by (series, time).
 
-    series: equal for one landmark and robot; rows ascend by (series, time).
+    series: equal for one landmark and robot.
     """
 
     series: Int64[np.ndarray, " n"]
@@ -93,7 +93,7 @@ def _rows(data: Sequence[Reference]) -> _Rows:
 
 
 class Constants(NamedTuple):
-    """Camera constants: range = scale · d · cos(b − axis) + offset [m], bearing + offset.
+    """range = scale · d · cos(b − axis) + offset [m]; bearing + offset.
 
     axis: None if the range is the distance. lens: coefficients of b, b² and b³ of excess bearing.
     """
@@ -121,7 +121,7 @@ class Constants(NamedTuple):
     def distances(
         self, ranges: Float[np.ndarray, " n"], bearings: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
-        """Distances [m] of raw ranges at these bearings; NaN far from the axis."""
+        """Distances [m] of raw ranges; NaN far from the axis."""
         sensor = Sensor(
             range_offset=self.range_offset,
             range_scale=self.range_scale,
@@ -132,20 +132,16 @@ class Constants(NamedTuple):
 
 
 def constants(data: Sequence[Reference], *, depth: bool) -> Constants:
-    """Fit the constants of all measurements as one camera.
-
-    Ranges under Huber's loss, bearings by the median. Raises CalibrationError for too few.
-    """
+    """Fit one camera: ranges under Huber's loss, bearings by the median."""
     return _constants(_enough(_rows(data)), depth)
 
 
 def joint_constants(
     data: Sequence[Reference], *, depth: bool
 ) -> tuple[Constants, Float[np.ndarray, "p p"]]:
-    """Fit the constants, with their joint covariance in the order of `Constants.figures`.
+    """Fit the constants, with their covariance in the order of `Constants.figures`:
 
-    The covariance is (JᵀWJ)⁻¹ JᵀW diag(e²) WJ (JᵀWJ)⁻¹ with residuals e, bounded (White 1980, A
-    heteroskedasticity-consistent covariance matrix estimator).
+    (JᵀWJ)⁻¹ JᵀW diag(e²) WJ (JᵀWJ)⁻¹ with bounded residuals e (White 1980).
     """
     rows = _enough(_rows(data))
     found = _constants(rows, depth)
@@ -207,7 +203,7 @@ def _constants(rows: _Rows, depth: bool) -> Constants:
 
 
 def _lens(rows: _Rows, offset: float) -> list[float]:
-    """Fit bearing offset and lens, a cubic of the raw bearing, under Huber's loss."""
+    """Fit offset and lens under Huber's loss."""
     error = on_circle(rows.bearing_errors - offset)
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(error)))
     powers = rows.bearings[:, np.newaxis] ** np.arange(4)
@@ -221,12 +217,11 @@ def _lens(rows: _Rows, offset: float) -> list[float]:
 
 
 def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str, float]:
-    """Fit the likeliest `Sensor` model.
+    """Fit the likeliest `Sensor`; raises CalibrationError.
 
     Constants are those of all robots together; noise is of residuals under each robot's own: σ² =
     σ₀² + (σ₁ d)² by likelihood, for bearings the median absolute deviation. White shares and times
-    T fit ρ(τ) = (1 − white) exp(−τ/T) to one landmark's error correlation. Raises CalibrationError
-    for too few measurements.
+    T fit ρ(τ) = (1 − white) exp(−τ/T) to one landmark's error correlation.
     """
     common = constants(data, depth=depth)
     parts = []
@@ -264,10 +259,7 @@ def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str
 
 
 def shares_by_landmark(data: Reference, *, depth: bool) -> dict[int, float]:
-    """Relative excess range of each landmark, given the robot's constants: medians less their mean.
-
-    Only landmarks with at least LEAST_MEASUREMENTS.
-    """
+    """Relative excess range of landmarks with LEAST_MEASUREMENTS: medians less their mean."""
     rows = _rows([data])
     if len(rows.series) < LEAST_MEASUREMENTS:
         return {}
@@ -304,7 +296,7 @@ def _persistence(
     seconds: Float[np.ndarray, " n"],
     relative: Float[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """(white share, correlation time [s]) of errors in units of σ; (1, 0) without correlation."""
+    """(white share, correlation time [s]); (1, 0) without correlation."""
     inside = np.abs(relative) < OUTLIER
     variance = float(np.mean(relative[inside] ** 2))
     counts, sums, times = (np.zeros(len(LAGS_S) - 1) for _ in range(3))
@@ -335,7 +327,7 @@ def _persistence(
 
 
 def _marker(data: Sequence[Reference], owns: Mapping[str, Constants]) -> dict[str, float]:
-    """Excess distance [m] of teammates, the median of the nearer half; empty if few."""
+    """Excess distance [m] of teammates, the median of the nearer half."""
     errors, distances = [np.zeros(0)], [np.zeros(0)]
     for each in data:
         seen, own = each.sighted, owns.get(each.robot)

@@ -1,6 +1,5 @@
 """Command `teamslam launch`."""
 
-import time
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from datetime import datetime
@@ -196,12 +195,11 @@ def _name_of(scenario: Scenario) -> str:
 def _launch(plan: "Plan") -> "Outcome":
     from teamslam.sim.launch.launch import LaunchError, launch
     from teamslam.sim.launch.live import show_live
-    from teamslam.sim.launch.processes import Starter
 
     scenario = plan.scenario
     try:
         with show_live(_name_of(scenario) or f"{scenario.name}, seed {scenario.seed}") as show:
-            return launch(plan, Starter(time.time_ns()), show)
+            return launch(plan, show)
     except LaunchError as error:
         fail(str(error))
     except KeyboardInterrupt:

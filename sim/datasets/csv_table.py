@@ -28,7 +28,7 @@ NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
 
 
 class UnknownColumnError(DatasetError):
-    """Table with a foreign column; header: all its columns."""
+    """Foreign column; header: all of the table."""
 
     def __init__(self, text: str, header: Sequence[str]) -> None:
         super().__init__(text)
@@ -37,10 +37,9 @@ class UnknownColumnError(DatasetError):
 
 @dataclass(frozen=True)
 class Origin:
-    """Columns of a map that a table comes from.
+    """Column map that a table comes from.
 
-    place: of the table in the map. columns: the user's column and its scale, by ours. unassigned:
-    further columns of the file.
+    columns: the user's column and its scale, by ours. unassigned: further columns of the file.
     """
 
     place: str
@@ -50,9 +49,9 @@ class Origin:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Text cells of a table by column; lines: file line of each row, from 1.
+    """Text cells by column; lines: file line of each row, from 1.
 
-    name: file name for errors. origin: where the table comes by a map of columns.
+    name: for errors. Methods that convert raise DatasetError.
     """
 
     name: str
@@ -69,12 +68,12 @@ class CsvTable:
         return all(column in self.columns for column in columns)
 
     def numbers(self, *columns: str) -> Float[np.ndarray, "rows columns"]:
-        """Finite numbers of the columns; raises DatasetError."""
+        """Finite numbers."""
         taken = [np.array(self._parsed(column, _number)) for column in columns]
         return np.column_stack(taken).astype(np.float64) if taken else np.zeros((len(self), 0))
 
     def known_numbers(self, *columns: str) -> Float[np.ndarray, "rows columns"]:
-        """Finite numbers of the columns, NaN in empty cells; raises DatasetError."""
+        """Finite numbers, NaN in empty cells."""
         taken = [
             np.array(self._parsed(column, lambda text: _number(text) if text else nan))
             for column in columns
@@ -82,7 +81,7 @@ class CsvTable:
         return np.column_stack(taken).astype(np.float64)
 
     def stamps(self, column: str, unit_s: Decimal = Decimal(1)) -> Int64[np.ndarray, " rows"]:
-        """Exact times in nanoseconds; raises DatasetError."""
+        """Exact times in nanoseconds."""
         scale = unit_s * NANO
 
         def remedy(unit: str, by: str) -> str:
@@ -92,10 +91,7 @@ class CsvTable:
         return np.array(parsed, dtype=np.int64)
 
     def names(self, column: str) -> UInt32[np.ndarray, " rows"]:
-        """Landmark numbers, or final numbers of texts with one prefix, such as tag36h11:5.
-
-        Raises DatasetError.
-        """
+        """Landmark numbers, or final numbers of texts with one prefix, such as tag36h11:5."""
         ends = [NAMED.fullmatch(cell) for cell in self.columns[column]]
         named = [end for end in ends if end is not None]
         if not named or len(named) < len(ends):
@@ -118,10 +114,9 @@ class CsvTable:
         return replace(self, columns=columns, lines=[self.lines[i] for i in rows])
 
     def filled(self, needed: Sequence[str]) -> "CsvTable":
-        """Omit entirely empty columns, except needed ones.
+        """Omit empty columns, except needed ones.
 
-        All columns stay if no row has more than the first needed one: a time alone is an empty
-        message.
+        All stay if no row has more than the first needed one: a time alone is an empty message.
         """
         empty = {name for name, cells in self.columns.items() if not any(cells)}
         if not set(self.columns) - empty - {*needed[:1]}:
@@ -130,7 +125,7 @@ class CsvTable:
         return replace(self, columns=columns)
 
     def conversion(self, column: str, unit: str, scale: str) -> str:
-        """Remedy for a column in another unit, in the map of columns if there is one."""
+        """Remedy for a column in another unit."""
         if self.origin is None or column not in self.origin.columns:
             robot, mark, file = self.name.partition("/")
             named = robot if robot and mark and "/" not in file else "r1"
@@ -153,7 +148,7 @@ class CsvTable:
         return DatasetError(f"{self.name}, line 1: {problem}")
 
     def lack(self, thing: str, forms: Sequence[Sequence[str]]) -> DatasetError:
-        """Error for columns that make up none of these forms; names those to assign in the map."""
+        """Error for columns that make up none of these forms."""
         given = ", ".join(column for column in self.columns if column in chain(*forms))
         problem = f"no {thing} in its columns" + (f" ({given} alone)" if given else "")
         remedy = f"give {' or '.join(','.join(form) for form in forms)}"
@@ -178,11 +173,10 @@ class CsvTable:
 
 
 def read_table(file: File, name: str, known: Sequence[str] | None = None) -> CsvTable:
-    """Read a table with a header line; skip empty lines and lines with `#`.
+    """Read a table with a header line; skip empty lines and lines with `#`; raises DatasetError.
 
-    known: allowed columns, in either case; None: any. Columns may be separated by ; or tabs,
-    decimals then by commas. An unnamed first column that counts rows is omitted. Raises
-    DatasetError.
+    known: allowed columns, in either case. Columns may be separated by ; or tabs, decimals then by
+    commas. An unnamed first column that counts rows is omitted.
     """
     try:
         text = file.read_bytes().decode("utf-8-sig")
@@ -304,7 +298,7 @@ def _stamp_ns(text: str, scale: Decimal, remedy: Callable[[str, str], str]) -> i
 
 
 def _unit_of(seconds: Decimal) -> tuple[str, str]:
-    """Probable unit of a Unix time read as seconds, and its scale."""
+    """Probable unit of a Unix time, and its scale."""
     unit, scale = "nanoseconds", "1e-9"
     for each, by in (("microseconds", "1e-6"), ("milliseconds", "1e-3")):
         if seconds.is_finite() and seconds * Decimal(by) <= LARGEST:
@@ -329,17 +323,14 @@ POSE_COVARIANCE = ("c_xx", "c_xy", "c_yy", "c_xt", "c_yt", "c_tt")
 
 
 def matrices(packed: Float[np.ndarray, "N 6"]) -> Float[np.ndarray, "N 3 3"]:
-    """Symmetric matrices from packed rows (xx, xy, yy, xt, yt, tt)."""
+    """Symmetric matrices from rows (xx, xy, yy, xt, yt, tt)."""
     return packed[:, [0, 1, 3, 1, 2, 4, 3, 4, 5]].reshape(-1, 3, 3)
 
 
 def numbers_in(
     table: CsvTable, form: tuple[str, ...], forms: Sequence[tuple[str, ...]]
 ) -> Float[np.ndarray, "R _"]:
-    """Numbers of one of the table's forms, NaN in rows of another.
-
-    Raises DatasetError for a row without exactly one form.
-    """
+    """Numbers of one of the table's forms, NaN in rows of another; each row has one form."""
     if form not in forms:
         return np.full((len(table), len(form)), np.nan)
     if len(forms) == 1:
@@ -361,7 +352,7 @@ def numbers_in(
 
 
 def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray, "R _"]:
-    """Packed covariance of each row, NaN if absent; raises DatasetError."""
+    """Packed covariance of each row, NaN if absent."""
     numbers = table.known_numbers(*columns)
     empty = np.isnan(numbers)
     for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1].tolist():
@@ -374,7 +365,7 @@ def covariances_of(table: CsvTable, columns: Sequence[str]) -> Float[np.ndarray,
 
 
 def pose_covariances(table: CsvTable) -> Float[np.ndarray, "N 3 3"]:
-    """Covariances of a table with all their columns; raises DatasetError."""
+    """Covariances of a table with all their columns."""
     missing = ", ".join(column for column in POSE_COVARIANCE if not table.has(column))
     if missing:
         raise table.fault(

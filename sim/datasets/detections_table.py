@@ -31,9 +31,9 @@ FILES = (DETECTIONS, "labels.csv")
 
 
 def detections_of(place: File, robot: str, classes: Sequence[str] = ()) -> Detections | None:
-    """Read a robot's detections without identities, or None. Raises DatasetError.
+    """Read detections without identities, or None; raises DatasetError.
 
-    Rows of one time are a scan; ids are labels, or NO_LABEL. classes: their names.
+    Rows of one time are a scan; ids are labels, or NO_LABEL.
     """
     table = _read(place, FILES[0], robot, COLUMNS)
     if table is None or not len(table):
@@ -65,7 +65,7 @@ def scans_of(
     signatures: Float[np.ndarray, " R"] | None,
     classes: Float[np.ndarray, "R C"] | None = None,
 ) -> Detections:
-    """Scans without identities, one per stamp, rows in table order. Raises DatasetError."""
+    """Scans without identities, one per stamp; raises DatasetError."""
     if (np.diff(stamps_ns) < 0).any():
         raise table.fault("its rows are not in order of time")
     for row in np.flatnonzero(ranges < 0.0)[:1].tolist():
@@ -85,7 +85,7 @@ def scans_of(
 
 
 def _classes_of(table: CsvTable, names: Sequence[str]) -> Float[np.ndarray, "R C"]:
-    """Compute ln P(reported | class): p for the reported class, (1 − p)/(C − 1) for others."""
+    """Compute ln P(reported | class): p for the reported one, (1 − p)/(C − 1) for others."""
     number_of = {name: str(number) for number, name in enumerate(names)}
     cells = [number_of.get(cell.strip(), cell) for cell in table.columns[CLASS]]
     for row, cell in enumerate(cells):
@@ -118,7 +118,7 @@ def merge_detections(named: Detections, unnamed: Detections | None) -> Detection
 def rows_of(
     seen: Detections,
 ) -> tuple[Sequence[str], Iterable[tuple[int, Sequence[object]]], Sequence[int]]:
-    """Columns of detections.csv, its rows (stamp [ns], numbers), and the labels."""
+    """Columns of detections.csv, rows (stamp [ns], numbers), labels."""
     numbers = np.column_stack((seen.ranges, seen.bearings))
     columns = ["t_s", *POLAR]
     if seen.covariances is not None:
@@ -163,7 +163,7 @@ def _read(place: File, name: str, robot: str, columns: Sequence[str]) -> CsvTabl
 
 
 def labels_of(table: CsvTable | None, rows: int) -> UInt32[np.ndarray, " R"]:
-    """Label of each row of detections.csv, or NO_LABEL."""
+    """Labels, row by row of detections.csv."""
     if table is None:
         return np.full(rows, NO_LABEL, np.uint32)
     if not table.has(*LABELS):

@@ -1,4 +1,4 @@
-"""A planar landmark graph: poses of robots, odometry between them, and points measured from them.
+"""A planar landmark graph: poses, odometry between them, points measured from them.
 
 As measurements, an odometry edge is an increment, and the points from a pose are one scan.
 """
@@ -31,7 +31,7 @@ Key = tuple[str, int]
 
 @dataclass(frozen=True)
 class PoseEdge:
-    """Pose `end` in the frame of pose `start`; covariance of an error in the frame of the end."""
+    """Pose `end` in the frame of `start`; covariance of an error in the frame of the end."""
 
     start: Key
     end: Key
@@ -51,10 +51,10 @@ class PointEdge:
 
 @dataclass
 class FactorGraph:
-    """Edges in the order of the file, and vertices where they are given.
+    """Edges in the order of the file, and vertices.
 
-    poses, landmarks: initial values, or with are_true true ones. priors: initial poses with their
-    covariance, None: exact. unused: numbers of lines by keyword that are not read.
+    poses, landmarks: initial values, or true ones. priors: initial poses with covariance, None:
+    exact. unused: counts of lines by keyword.
     """
 
     name: str
@@ -73,9 +73,8 @@ class FactorGraph:
         return tuple(sorted({edge.start[0] for edge in self.pose_edges}))
 
     def chain(self, robot: str) -> tuple[list[Key], list[PoseEdge]]:
-        """A robot's poses by number, and the odometry edges between neighbours.
-
-        Raises DatasetError for neighbours without an edge.
+        """A robot's poses by number, and the odometry edges between neighbours; raises
+        DatasetError.
         """
         keys = {key for e in self.pose_edges for key in (e.start, e.end) if key[0] == robot}
         keys |= {edge.pose for edge in self.point_edges if edge.pose[0] == robot}
@@ -98,7 +97,7 @@ def _show_key(key: Key) -> str:
 
 
 def split_at_gaps(graph: FactorGraph) -> FactorGraph:
-    """Split a graph whose poses have numbers alone, where no edge leads on."""
+    """Make robots of poses with numbers alone, split where no edge leads on."""
     links = {(edge.start, edge.end) for edge in graph.pose_edges}
     keys = sorted({key for link in links for key in link} | {e.pose for e in graph.point_edges})
     ends = [after for before, after in pairwise(keys) if (before, after) not in links]
@@ -116,7 +115,7 @@ def split_at_gaps(graph: FactorGraph) -> FactorGraph:
 
 
 def place_by_odometry(graph: FactorGraph) -> None:
-    """Place poses without a vertex by odometry, and landmarks by their first edge."""
+    """Place missing vertices by odometry, and landmarks by their first edge."""
     for robot in graph.robots:
         keys, edges = graph.chain(robot)
         pose = graph.poses.setdefault(keys[0], np.zeros(3))
@@ -134,10 +133,10 @@ def _place_point(pose: Pose, point: Point) -> Point:
 
 
 def streams_of_graph(graph: FactorGraph) -> WorldStreams:
-    """Measurements of the robots, named r1, r2, … in their order; raises DatasetError.
+    """Measurements of robots r1, r2, …; raises DatasetError.
 
-    The first robot starts at its prior, at its first vertex, or at the origin; the others at their
-    priors, if any.
+    The first robot starts at its prior, its first vertex, or the origin; the others at their
+    priors.
     """
     if not graph.point_edges:
         raise DatasetError(
@@ -196,7 +195,6 @@ def _stream(graph: FactorGraph, robot: str, name: str, names: tuple[str, ...]) -
 
 
 def _scans(edges: Sequence[PointEdge], at: Mapping[Key, int]) -> tuple[Scans, str]:
-    """Points by time, each landmark once per pose, and a note on others."""
     edges = sorted(edges, key=lambda edge: at[edge.pose])
     points = np.array([edge.point for edge in edges]).reshape(-1, 2)
     scans = Scans(

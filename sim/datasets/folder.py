@@ -66,9 +66,10 @@ REQUIRED = {
 def folder(
     world: FolderWorld, robots: Sequence[RobotConfig], classes: Sequence[str] = ()
 ) -> WorldStreams:
-    """Read these robots' measurements; raises DatasetError. classes: names of detections' classes.
+    """Read these robots' measurements; raises DatasetError.
 
-    Odometry stamps are shifted by the robot's clock_offset_s, which the robot corrects.
+    classes: names of detections' classes. Odometry stamps are shifted by clock_offset_s, which the
+    robot corrects.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")

@@ -24,12 +24,12 @@ EXPECTED = (
 
 
 class NoTablesError(DatasetError):
-    """No robot's table; possibly another kind of data set."""
+    """No robot's table."""
 
 
 @contextmanager
 def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
-    """Open the data set's folder and each robot's by name; raises DatasetError."""
+    """Open the folder, and each robot's by name; raises DatasetError."""
     place = Path(path)
     if not place.exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
@@ -50,7 +50,7 @@ def _root(archive: zipfile.Path) -> zipfile.Path:
 
 
 def scenario_in(path: str | Path) -> File | None:
-    """Scenario beside a data set's files, in a folder or zip."""
+    """Scenario in a folder or zip."""
     place: File = Path(path)
     if not place.is_dir():
         place = _root(zipfile.Path(path))
@@ -59,7 +59,7 @@ def scenario_in(path: str | Path) -> File | None:
 
 
 def has_tables(path: str | Path) -> bool:
-    """Whether robots' tables exist, under any folder names; raises DatasetError."""
+    """Whether robots' tables exist; raises DatasetError."""
     if not Path(path).exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}; or a UTIAS set, or a bag")
     try:
@@ -74,9 +74,7 @@ def has_tables(path: str | Path) -> bool:
 
 
 def has_detections(path: str) -> bool:
-    """Whether a robot has detections without identities; False for a folder that is not readable,
-    which reading it reports.
-    """
+    """Whether a robot has detections without identities; False for an unreadable folder."""
     if not path:
         return False
     with suppress(DatasetError, OSError), open_folder(path) as (_, robots):
@@ -85,7 +83,7 @@ def has_detections(path: str) -> bool:
 
 
 def robots_of(path: str) -> tuple[str, ...]:
-    """Robot names of a folder, r2 before r10; raises DatasetError."""
+    """Robots of a folder, r2 before r10; raises DatasetError."""
     with open_folder(path) as (_, robots):
         return tuple(robots)
 
@@ -115,12 +113,12 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def name_table(place: File, file: File, robot: str) -> str:
-    """Table name for errors, with the robot's folder if any."""
+    """Name of a table for errors."""
     return f"{robot}/{file.name}" if place.name == robot else file.name
 
 
 def unused_files(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
-    """Describe CSV files that are no table, and folders of no robot."""
+    """Describe CSV files and folders that are not read."""
     known = {*tables, "detections", "labels"}
     notes = []
     for place in dict.fromkeys([root, *folders.values()]):

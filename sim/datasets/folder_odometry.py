@@ -50,14 +50,13 @@ hundredth.
 
 
 def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, list[str]]:
-    """Convert odometry of any form; stamps are shifted by the clock offset offset_ns.
+    """Convert odometry of any form; stamps are shifted by offset_ns.
 
-    Speeds hold from t_s to the next row, and the last row only ends the last interval; with a
-    column duration_s they are means over the time that ends at t_s. Poses are at t_s; an increment
-    spans from the previous row to t_s. A car's wheel speed and steering hold like speeds. A
-    covariance is of the row's motion (a pose's: the motion since the previous row), for an error in
-    the frame of its end; speeds with one become increments. With duration_s, speed and increment
-    rows may be mixed.
+    Speeds, and a car's wheel speed and steering, hold from t_s to the next row; with duration_s
+    they are means over the time that ends at t_s. Poses are at t_s; an increment spans from the
+    previous row to t_s. A covariance is of the row's motion (a pose's: since the previous row), for
+    an error in the frame of its end; speeds with one become increments. With duration_s, speed and
+    increment rows may be mixed.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -110,7 +109,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
 
 def _check_times(rows: Rows) -> None:
-    """Raise DatasetError where many rows have the time of another row with other values."""
+    """Refuse many rows with the time of another row and other values."""
     cells = list(zip(*(c for name, c in rows.table.columns.items() if name != "t_s"), strict=True))
     same = (np.flatnonzero(np.diff(rows.stamps_ns) == 0) + 1).tolist()
     others = [row for row in same if cells[row] != cells[row - 1]]
@@ -127,10 +126,7 @@ def _check_times(rows: Rows) -> None:
 
 
 def pace_notes(duration_ns: Int64[np.ndarray, " I"], table: CsvTable | None = None) -> list[str]:
-    """Note on odometry whose usual interval is implausible in seconds.
-
-    Raises DatasetError for a table whose usual interval is impossible.
-    """
+    """Note on an implausible interval; an impossible one raises DatasetError."""
     usual_s = 1e-9 * float(np.median(duration_ns)) if len(duration_ns) else SHORTEST_S
     if SHORTEST_S <= usual_s <= LONGEST_S:
         return []
@@ -146,7 +142,7 @@ def pace_notes(duration_ns: Int64[np.ndarray, " I"], table: CsvTable | None = No
 
 
 def _drop_other_clocks(rows: Rows) -> None:
-    """Keep the longest stretch between clock jumps, as when a clock is first set."""
+    """Keep the longest stretch between clock jumps."""
     jumps = np.flatnonzero(np.diff(rows.stamps_ns) > JUMP_NS) + 1
     if not len(jumps):
         return
@@ -170,8 +166,8 @@ def _omit_resets(
 ) -> Float[np.ndarray, "M 3"]:
     """Continue the previous motion across an odometry reset or a wrong row.
 
-    A step of RESET_M or more is a reset if it returns to the first pose faster than any usual step,
-    or is RESET_TIMES as fast as nine steps of ten.
+    A step of RESET_M is one if it returns to the first pose faster than any usual step, or is
+    RESET_TIMES as fast as nine steps of ten.
     """
     lengths, seconds = np.hypot(*steps[:, :2].T), duration * 1e-9
     if len(steps) < LEAST_STEPS:
@@ -224,7 +220,6 @@ def _find_filled(table: CsvTable, columns: tuple[str, ...]) -> Bool[np.ndarray, 
 
 
 def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
-    """Raise DatasetError for a duration_s that is not positive; note deviations from row times."""
     if not rows.table.has("duration_s"):
         return
     stated = rows.table.stamps("duration_s")
@@ -242,7 +237,7 @@ def _judge_speeds(
     steps: Float[np.ndarray, "N _"],
     duration: Int64[np.ndarray, " N"],
 ) -> None:
-    """Note implausible motions, which robots refuse; raise DatasetError for a turn in degrees."""
+    """Note impossible motions; refuse turns in degrees."""
     if form == STEERED or not len(steps):
         return
     seconds = duration * 1e-9
@@ -272,8 +267,8 @@ def _judge_speeds(
 
 
 def _usual_maximum(rate: Float[np.ndarray, " N"], seconds: Float[np.ndarray, " N"]) -> float:
-    """Mean yaw rate [rad/s] that LEAST_WHIRLS and a share WHIRLS of stretches of 1 s reach, which
-    single wrong rows and jittering stamps do not raise. NaN rates, of another form, count as 0.
+    """Mean yaw rate [rad/s] that LEAST_WHIRLS and a share WHIRLS of stretches of 1 s reach,
+    whatever single rows and jitter are. NaN rates count as 0.
     """
     ends = np.append(0.0, np.cumsum(seconds))
     stretches = min(int(ends[-1]), len(rate))
@@ -298,7 +293,6 @@ def _forms(table: CsvTable) -> tuple[tuple[str, ...], ...]:
 
 
 def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, "1"]:
-    """Length of the first interval: the second's, unless a column gives it."""
     if rows.table.has("duration_s") and len(rows.table):
         return rows.table.rows([True]).stamps("duration_s")
     rows.notes.append("the first increment is taken to last as long as the second")
@@ -308,14 +302,14 @@ def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.nda
 def arcs(
     speeds: Float[np.ndarray, "N 2"], duration_ns: Int64[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
-    """Motion (forward, left, turn) at constant speed and yaw rate: the chord of the arc."""
+    """Chord (forward, left, turn) of the arc at constant speed and yaw rate."""
     ahead, turn = (speeds * (duration_ns * 1e-9)[:, np.newaxis]).T
     chord = ahead * np.sinc(0.5 * turn / np.pi)
     return np.column_stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn])
 
 
 def motions_between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
-    """Each pose in the frame of the previous one: (forward, left, turn)."""
+    """Each pose in the frame of the previous one."""
     dx, dy, turn = np.diff(poses, axis=0).T if len(poses) > 1 else np.zeros((3, 0))
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, on_circle(turn)])

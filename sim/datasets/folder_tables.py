@@ -1,7 +1,4 @@
-"""Convert one robot's tables in a data set's folder to ordered measurements.
-
-Unused rows are counted in notes, with reason and first line.
-"""
+"""Convert a robot's tables to ordered measurements; unused rows are counted in notes."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -52,7 +49,7 @@ most.
 
 
 class Rows:
-    """Ordered rows of a table, and notes on omitted ones."""
+    """Ordered rows, and notes on omitted ones."""
 
     def __init__(self, table: CsvTable, thing: str) -> None:
         self.thing = thing
@@ -86,12 +83,12 @@ class Rows:
         return stamps
 
     def equal(self, column: str, names: Sequence[str]) -> Bool[np.ndarray, " rows"]:
-        """Mask of rows with one of these names in a column."""
+        """Mask of rows with one of these names."""
         among = set(names)
         return np.array([cell in among for cell in self.table.columns[column]], dtype=np.bool_)
 
     def note(self, chosen: Bool[np.ndarray, " rows"], what: str) -> None:
-        """Note a remark about these rows, which stay."""
+        """Note a remark about rows that stay."""
         if chosen.any():
             first = int(np.flatnonzero(chosen)[0])
             self._note(int(np.count_nonzero(chosen)), what, self.table, first)
@@ -110,8 +107,7 @@ def measurements_of(
 ) -> tuple[Scans, Int64[np.ndarray, " E"], list[str]]:
     """Measurements of landmarks, or of teammates by index, and the times of empty rows.
 
-    team: own name and all names. driven: begin and end of the odometry, or None. Raises
-    DatasetError.
+    team: own name and all names. driven: begin and end of the odometry.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -177,7 +173,6 @@ def _cells(table: CsvTable) -> list[tuple[str, ...]]:
 
 
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
-    """Ranges and bearings or points, with covariances if allowed."""
     table = rows.table
     forms = [form for form in (POLAR, POINTS) if table.has(*form)]
     if not forms:
@@ -196,9 +191,7 @@ def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
 def check_polar(
     table: CsvTable, ranges: Float[np.ndarray, " R"], bearings: Float[np.ndarray, " R"]
 ) -> None:
-    """Raise DatasetError for ranges that are bearings, and for bearings in degrees; NaN in rows of
-    another form.
-    """
+    """Refuse ranges that are bearings, and bearings in degrees; NaN in rows of another form."""
     below = ranges <= 0.0
     count, measured = int(np.count_nonzero(below)), int(np.count_nonzero(~np.isnan(ranges)))
     varied = len(np.unique(ranges[below]))  # few values mark an echo that did not return
@@ -245,10 +238,7 @@ def _own(
 def fixes_of(
     table: CsvTable | None, driven: tuple[int, int] | None
 ) -> tuple[Int64[np.ndarray, " F"], Float[np.ndarray, "F 5"], list[str]]:
-    """Times, absolute positions with covariances (x, y, xx, xy, yy; NaN if not stated), and notes.
-
-    Raises DatasetError.
-    """
+    """Times, positions with covariances (x, y, xx, xy, yy; NaN if not stated), and notes."""
     if table is None:
         return np.empty(0, np.int64), np.empty((0, 5)), []
     rows = Rows(table, "position")
@@ -280,7 +270,7 @@ def fixes_of(
 def truth_of(
     table: CsvTable | None, driven: tuple[int, int] | None
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], list[str]]:
-    """True poses by time; driven: begin and end of the odometry, or None."""
+    """True poses by time, and notes."""
     if table is None:
         return np.empty(0, np.int64), np.zeros((0, 3)), []
     rows = Rows(table, "true pose")
@@ -299,11 +289,10 @@ def truth_of(
 
 
 def _are_degrees(poses: Float[np.ndarray, "N 3"]) -> bool:
-    """Whether headings θ follow the directions δ of the path's chords in degrees, not in radians.
+    """Whether headings θ follow the directions δ of the path's chords in degrees.
 
-    Concentration: |mean of exp(2i(δ − θ))|, 1 for a robot that drives forward or backward, at any
-    constant offset. Degrees must explain twice as much as θ = 0, which small angles are: a robot
-    that spins along a straight path does not follow it. Radians may exceed a whole turn.
+    Concentration: |mean of exp(2i(δ − θ))|, 1 for driving forward or backward, at any constant
+    offset. Degrees must explain twice as much as θ = 0, which small angles are.
     """
     if len(poses) < LEAST_CHORDS:
         return False
@@ -324,7 +313,7 @@ def _are_degrees(poses: Float[np.ndarray, "N 3"]) -> bool:
 
 
 def start_of(table: CsvTable) -> StartPose | None:
-    """Initial pose of a one-row table; None without rows."""
+    """Initial pose of a one-row table."""
     if not len(table):
         return None
     if len(table) > 1:

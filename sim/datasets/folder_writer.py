@@ -68,11 +68,7 @@ def _write_robot(place: Path, stream: RobotStream) -> None:
 
 
 def _odometry(stream: RobotStream) -> tuple[Sequence[str], list[Row]]:
-    """Columns and rows on the odometry's clock.
-
-    A row is at each interval's start and at the end of the last; for increments or mixed forms, at
-    each end.
-    """
+    """Columns, and rows at each interval's start and the last end; of increments at each end."""
     intervals = stream.intervals
     ends_ns = intervals.end_ns - stream.clock_offset_ns
     if intervals.increments is not None:

@@ -80,12 +80,12 @@ SYMBOL = re.compile("([A-Za-z]+)([0-9]{1,10})")
 
 
 def is_pyfg(line: Line) -> bool:
-    """Whether a graph's line has named vertices, as this format has."""
+    """Whether a line has named vertices."""
     return any(SYMBOL.fullmatch(word) for word in line.words[:3])
 
 
 def read_pyfg(path: Path) -> FactorGraph:
-    """Read a file; raises DatasetError with file, line and remedy."""
+    """Read a file; raises DatasetError."""
     graph = FactorGraph(path.stem, are_true=True)
     for line, values in read_lines(path, FORMS, graph):
         _take(line, values, graph)
@@ -123,7 +123,6 @@ def _key(line: Line, k: int) -> Key:
 
 
 def _matrix(line: Line, upper: Float[np.ndarray, " u"], size: int) -> Matrix:
-    """Symmetric covariance; raises DatasetError if it is not positive definite."""
     matrix = np.zeros((size, size))
     matrix[np.triu_indices(size)] = upper
     matrix += np.triu(matrix, 1).T

@@ -39,7 +39,7 @@ SPATIAL = ("EDGE3", "VERTEX3", "EDGE_SE3:QUAT", "VERTEX_SE3:QUAT", "EDGE_SE3_XYZ
 
 
 class Form(NamedTuple):
-    """Words before the numbers of a keyword's line, counts of numbers, and their meaning."""
+    """Words before a line's numbers, counts of numbers, their meaning."""
 
     names: int
     counts: tuple[int, ...]
@@ -64,7 +64,7 @@ HEAD = 65_536
 
 
 class Line(NamedTuple):
-    """Keyword and words of a line, with its place for errors."""
+    """Keyword and words of a line, with its place."""
 
     name: str
     number: int
@@ -106,10 +106,7 @@ def lines_of(path: Path) -> Iterator[Line]:
 def read_lines(
     path: Path, forms: Mapping[str, Form], graph: FactorGraph
 ) -> Iterator[tuple[Line, Float[np.ndarray, " n"]]]:
-    """Lines of a graph with their numbers; lines of other keywords are counted in the graph.
-
-    forms: of each keyword. Raises DatasetError with file, line and remedy.
-    """
+    """Lines with their numbers; other keywords are counted in the graph; raises DatasetError."""
     for line in lines_of(path):
         if line.keyword in SPATIAL:
             raise line.error("a graph in three dimensions; planar ones are read")
@@ -128,7 +125,7 @@ def read_lines(
 
 
 def first_line(path: Path) -> Line | None:
-    """First line of a graph's file, of either format; None for other files."""
+    """First line of a graph; None for other files."""
     known = {*FORMS, *SPATIAL, "VERTEX_SE2:PRIOR", "EDGE_RANGE"}
     with path.open("rb") as file:
         head = file.read(HEAD).decode("utf-8", errors="replace")
@@ -142,7 +139,7 @@ def first_line(path: Path) -> Line | None:
 
 
 def read_graph(path: Path) -> FactorGraph:
-    """Read a file and its errorless twin NAME_groundtruth, if there; raises DatasetError."""
+    """Read a file and its errorless twin NAME_groundtruth; raises DatasetError."""
     graph = _read(path)
     twin = path.with_name(f"{path.stem}{TRUTH}{path.suffix}")
     if twin.is_file():
@@ -194,7 +191,7 @@ def _covariance(
 
 
 def inverse_of(line: Line, information: Matrix) -> Matrix:
-    """Inverse of a positive definite matrix; raises DatasetError with the line."""
+    """Inverse of a positive definite matrix; raises DatasetError."""
     if np.linalg.eigvalsh(information)[0] <= 0.0:
         raise line.error("its information is not positive definite: correct its last numbers")
     inverse = np.linalg.inv(information)
@@ -204,7 +201,7 @@ def inverse_of(line: Line, information: Matrix) -> Matrix:
 def turn_covariance(
     covariance: Float[np.ndarray, "*N 3 3"], theta: Float[np.ndarray, "*N"] | float
 ) -> Float[np.ndarray, "*N 3 3"]:
-    """Covariance of a motion, from the axes of its start to those of its end, turned by theta."""
+    """Covariance of a motion, from the axes of its start to those of its end."""
     c, s = np.cos(theta), np.sin(theta)
     zero, one = np.zeros_like(c), np.ones_like(c)
     rows = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=-1)

@@ -17,7 +17,7 @@ FORMATS = (
 
 
 def kind_of(path: str | Path) -> Kind:
-    """Kind of a data set; raises DatasetError for others."""
+    """Kind of a data set; raises DatasetError."""
     if not Path(path).exists():
         raise DatasetError(f"{path}: no such file or folder; {FORMATS}")
     if graph.is_graph(path):

@@ -1,4 +1,4 @@
-"""A robot's measurements by row, for all data sets' tables."""
+"""A robot's measurements by row."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -10,7 +10,7 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 @dataclass(frozen=True)
 class Scans:
-    """A robot's measurements by time; ids: landmarks, teammate indices, or UTIAS subjects."""
+    """Measurements by time; ids: landmarks, teammate indices, or UTIAS subjects."""
 
     stamps_ns: Int64[np.ndarray, " R"]
     ids: UInt32[np.ndarray, " R"]
@@ -37,7 +37,7 @@ def first_of_each(
     ids: UInt32[np.ndarray, " R"],
     usable: Bool[np.ndarray, " R"],
 ) -> Bool[np.ndarray, " R"]:
-    """Mask of the first usable measurement of each (stamp, id)."""
+    """Mask of the first usable row of each (stamp, id)."""
     rows = np.flatnonzero(usable)
     order = rows[np.lexsort((ids[rows], stamps_ns[rows]))]
     repeated = (np.diff(stamps_ns[order]) == 0) & (np.diff(ids[order].astype(np.int64)) == 0)
@@ -47,12 +47,12 @@ def first_of_each(
 
 
 def on_circle(angles: Float[np.ndarray, "*N"]) -> Float[np.ndarray, "*N"]:
-    """Wrap angles to (−π, π], leaving the bits of those inside."""
+    """Wrap to (−π, π], leaving the bits of angles inside."""
     turned = (angles + np.pi) % (2.0 * np.pi) - np.pi
     turned = np.where(turned == -np.pi, np.pi, turned)
     return np.where((angles > -np.pi) & (angles <= np.pi), angles, turned)
 
 
 def count_note(count: int, thing: str, what: str) -> str:
-    """Note such as "2 measurements dropped: unknown barcode"; empty for none."""
+    """Note such as "2 measurements dropped"; empty for none."""
     return f"{count} {thing}{'s' if count != 1 else ''} {what}" if count else ""

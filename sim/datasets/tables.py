@@ -20,12 +20,12 @@ class DatasetError(ValueError):
 
 
 class MarkerError(DatasetError):
-    """No folder has the marker file of its kind of data set."""
+    """No folder has the marker file."""
 
 
 @contextmanager
 def open_data_set(path: str, marker: str) -> Iterator[Mapping[str, File]]:
-    """Files by name in the one folder, within `path` (folder or zip), that holds `marker`."""
+    """Files by name in the one folder, within `path`, that holds `marker`."""
     place = Path(path)
     if not place.exists():
         raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
@@ -46,10 +46,7 @@ EXPECTED = (
 
 
 def table(file: File, columns: tuple[str, ...]) -> Float[np.ndarray, "rows columns"]:
-    """Numbers of a white-space table with `#` comments; may have 0 rows.
-
-    Raises DatasetError for a line without as many finite numbers.
-    """
+    """Numbers of a white-space table with `#` comments; raises DatasetError."""
     lines = file.read_bytes().decode("utf-8", errors="replace").splitlines()
     rows = [line for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
@@ -67,7 +64,7 @@ def table(file: File, columns: tuple[str, ...]) -> Float[np.ndarray, "rows colum
 def optional_table(
     files: Mapping[str, File], name: str, columns: tuple[str, ...]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Numbers of an optional table; no rows if missing."""
+    """Numbers of a table, no rows if missing."""
     return table(files[name], columns) if name in files else np.zeros((0, len(columns)))
 
 

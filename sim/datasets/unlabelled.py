@@ -64,9 +64,9 @@ def is_car(path: str | Path) -> bool:
 
 
 def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
-    """Streams of a data set, cut into one piece per robot. Raises DatasetError.
+    """Streams of a data set, cut into one piece per robot; raises DatasetError.
 
-    Pieces are consecutive in the log and begin at one time here.
+    Pieces begin at one time here.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset FOLDER; {EXPECTED}")
@@ -98,7 +98,7 @@ def _table(root: Path, name: str, *needed: str) -> CsvTable:
 
 
 def _form(odometry: CsvTable) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Columns of odometry.csv and detections.csv, determined by the former."""
+    """Columns of both tables, by those of odometry.csv."""
     own = {CAR: CAR[1:], STEPS + POSE_COVARIANCE: STEPS}
     form = max(own, key=lambda each: sum(odometry.has(column) for column in own[each]))
     if not any(odometry.has(column) for column in own[form]):
@@ -158,7 +158,7 @@ def _stream(root: Path, world: UnlabelledWorld) -> RobotStream:
 def _read_car(
     odometry: CsvTable, detections: CsvTable, labels: UInt32[np.ndarray, " R"]
 ) -> tuple[Intervals, Detections]:
-    """Convert a car's tables; odometry holds until the next row, the first also before its time."""
+    """Convert a car's tables; the first row also holds before its time."""
     stamps, seen_ns = odometry.stamps("t_s"), detections.stamps("t_s")
     if not len(stamps):
         raise odometry.fault("no row")
@@ -233,7 +233,7 @@ def _positions(
 
 
 def pieces(whole: RobotStream, count: int) -> tuple[RobotStream, ...]:
-    """Cut a log into robots r1, r2, … of equal interval counts and unknown initial poses."""
+    """Cut a log into robots of equal interval counts and unknown initial poses."""
     intervals = whole.intervals
     bounds = np.linspace(0, len(intervals.end_ns), count + 1).astype(np.int64)
     names = tuple(f"r{i + 1}" for i in range(count))

@@ -1,8 +1,7 @@
 """UTIAS multi-robot cooperative localisation and mapping data sets (MRCLAM).
 
 Leung, Halpern, Barfoot, Liu, IJRR 30(8):969-974, 2011. Measurements name a *barcode*;
-`Barcodes.dat` gives its subject: a robot (its number) or a landmark. Dropped rows are counted in
-notes.
+`Barcodes.dat` gives its subject: a robot or a landmark.
 """
 
 import hashlib
@@ -31,7 +30,7 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 @dataclass(frozen=True)
 class Erratum:
-    """A data set's fault: measurements of subject k are of subject subjects[k]."""
+    """Measurements of subject k are of subjects[k]."""
 
     name: str
     subjects: Mapping[int, int]
@@ -60,7 +59,7 @@ ERRATA: Mapping[str, Erratum] = {
 def erratum_of(
     barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarray, "L 5"]
 ) -> Erratum | None:
-    """Known erratum of the data set with these tables, or None."""
+    """Known erratum of the data set."""
     return ERRATA.get(content_digest(barcodes, landmarks))
 
 
@@ -75,11 +74,11 @@ MEASUREMENT = ("time [s]", "barcode", "range [m]", "bearing [rad]")
 
 
 def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
-    """Read the measurements of robots r1, r2, … (data set numbers); raises DatasetError.
+    """Read the measurements of robots r1, r2, …; raises DatasetError.
 
-    Odometry row k acts from its time to the next row's, delayed by odometry_delay_s and the robot's
-    clock_offset_s, which the robot corrects. Stamps are nanoseconds since 1970. A robot's initial
-    pose is its ground truth at its first measurement, with the world's start sigmas.
+    Odometry row k acts from its time to the next row's, delayed by odometry_delay_s and
+    clock_offset_s, which the robot corrects. Stamps are nanoseconds since 1970. The initial pose is
+    the truth at the first measurement, with the world's start sigmas.
     """
     if not world.path:
         raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
@@ -142,10 +141,9 @@ def _landmarks(
 
 
 class _Reading(NamedTuple):
-    """Files of a data set, and the values that all its robots share.
+    """Values that all robots share.
 
-    subject_of: barcode → subject. clocks: offset [ns] of each robot of the team. last_robot: the
-    largest subject of a robot.
+    subject_of: barcode → subject. clocks: offsets [ns]. last_robot: largest subject of a robot.
     """
 
     world: UtiasWorld
@@ -157,13 +155,12 @@ class _Reading(NamedTuple):
 
 
 def present_robots(files: Mapping[str, File]) -> list[int]:
-    """Numbers of the robots with an odometry or measurement file."""
+    """Numbers of the robots with files."""
     matches = (re.fullmatch(r"Robot([1-9]\d*)_(Odometry|Measurement)\.dat", name) for name in files)
     return sorted({int(match[1]) for match in matches if match})
 
 
 def _subject(robot: str, files: Mapping[str, File]) -> int:
-    """Subject of a robot r1, r2, …; raises DatasetError for one without files."""
     present = present_robots(files)
     subject = int(robot[1:]) if re.fullmatch(r"r[1-9]\d*", robot) else 0
     if subject not in present:
@@ -289,7 +286,7 @@ def intervals_of(
 def measurements_of(
     rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
 ) -> tuple[Scans, tuple[str, ...]]:
-    """Convert measurement rows (t, barcode, range, bearing) to measurements by subject."""
+    """Convert rows (t, barcode, range, bearing) to measurements by subject."""
     rows, backward = _sort_by_time(rows)
     codes = np.array(sorted(subject_of), dtype=np.float64)
     subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
@@ -319,7 +316,7 @@ def measurements_of(
 def truth_of(
     rows: Float[np.ndarray, "N 4"],
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], tuple[str, ...]]:
-    """Unchanged ground truth rows (t, x, y, θ) by time."""
+    """Rows (t, x, y, θ) by time."""
     rows, backward = _sort_by_time(rows)
     stamps = nanoseconds(rows[:, 0])
     notes = [
@@ -336,8 +333,8 @@ def start_pose(
 ) -> Float[np.ndarray, "3"] | None:
     """True pose at start_ns, interpolated on the circle, or None.
 
-    Resampled truth has wrong headings beside ±π, so only samples about the start that agree with
-    the one nearest to all others count.
+    Resampled truth has wrong headings beside ±π: only samples that agree with the most central one
+    count.
     """
     first, last = np.searchsorted(
         truth_ns, [start_ns - START_WINDOW_NS, start_ns + START_WINDOW_NS + 1]
@@ -356,6 +353,6 @@ def start_pose(
 
 
 def _sort_by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
-    """Sort rows stably by the first column; also return the number of backward steps."""
+    """Stably sorted rows, and the number of backward steps."""
     backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
     return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward

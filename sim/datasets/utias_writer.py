@@ -15,11 +15,10 @@ FIRST_BARCODE = 100
 
 
 def write_utias(streams: WorldStreams, directory: Path | str) -> None:
-    """Write a folder of text files: times in microseconds, other numbers to nine decimals.
+    """Write text files: times in microseconds, other numbers to nine decimals.
 
-    Robot i becomes subject and file i + 1. Landmarks keep their ids unless one is a robot's subject
-    (1 … 5, or the number of robots): then all ids are moved beyond. The format has no start poses,
-    covariances or empty messages.
+    Robot i becomes subject i + 1. Landmarks keep their ids unless one is a robot's subject: then
+    all move beyond. The format has no start poses, covariances or empty messages.
     """
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
@@ -84,7 +83,6 @@ def _write_robot(folder: Path, stream: RobotStream, number: Mapping[str, int], s
 
 
 def _odometry_rows(stream: RobotStream) -> list[Row]:
-    """A row at the start of each interval and at the end of the last."""
     intervals = stream.intervals
     if not len(intervals.end_ns):
         return []

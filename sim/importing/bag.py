@@ -42,7 +42,7 @@ SAMPLED_MESSAGES = 2000
 
 
 class UndecidedError(DatasetError):
-    """A bag's topics are ambiguous; the text has a remedy."""
+    """Ambiguous topics; the text has a remedy."""
 
 
 class Proposal(NamedTuple):
@@ -54,13 +54,13 @@ class Proposal(NamedTuple):
 
 
 def propose_topics(path: Path) -> str:
-    """Describe a bag's topics, with a proposed assignment file; raises BagError."""
+    """Describe a bag's topics, with a proposed assignment; raises BagError."""
     with opened_bag(path) as bag:
         return _question(path, bag, _proposed(bag, None))
 
 
 def propose_assignment(path: Path) -> str:
-    """Proposed assignment file of a bag's topics; raises BagError."""
+    """Proposed assignment file; raises BagError."""
     with opened_bag(path) as bag:
         found = _proposed(bag, None)
         topics = [*listing(bag.topics).splitlines(), *found.warnings]
@@ -68,7 +68,7 @@ def propose_assignment(path: Path) -> str:
 
 
 def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
-    """Topics of each robot by names and types; raises UndecidedError if ambiguous."""
+    """Topics by names and types; raises UndecidedError."""
     found = _proposed(bag, robot)
     if found.warnings:
         raise UndecidedError(_question(path, bag, found))
@@ -133,9 +133,8 @@ def _proposed(bag: Bag, robot: str | None) -> Proposal:
 
 
 def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> list[str] | list[None]:
-    """Namespaces that are robots; None: all topics are one robot's.
-
-    They are one robot's if none has both odometry and detections, and all odometry has one frame.
+    """Namespaces that are robots; None: all topics are one robot's, as none has both odometry and
+    detections, and all odometry has one frame.
     """
     spaces = sorted({_namespace(name) for name in bases})
     if len(spaces) < 2:
@@ -171,7 +170,7 @@ def _choice(odometry: list[str]) -> str:
 def _candidates(
     topics: list[Topic], tagged: set[str], space: str | None
 ) -> tuple[list[str], list[str], list[str]]:
-    """Candidates for odometry (likeliest first), detections and truth in a namespace; None: all."""
+    """Odometry (likeliest first), detections and truth in a namespace; None: all."""
     here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
     true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
     odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
@@ -221,7 +220,7 @@ def _tags_in(bag: Bag) -> set[str]:
 
 
 def listing(topics: list[Topic]) -> str:
-    """Describe a bag's topics, one per line, with remarks on unusable ones."""
+    """Describe a bag's topics, one per line."""
     lines = []
     for topic in topics:
         used = "" if topic.kind in READERS else "   (not read here)"
@@ -251,7 +250,7 @@ def as_toml(found: Proposal) -> str:
 class Imported:
     """Tables of a bag's robots.
 
-    notes: topics used and omitted, with reasons. messages: number read. datum: origin of fixes.
+    notes: topics used and omitted. messages: number read. datum: origin of fixes.
     """
 
     robots: list[RobotTables]
@@ -265,8 +264,7 @@ def import_bag(
 ) -> Imported:
     """Tables of a bag; raises BagError, UndecidedError.
 
-    topics: of each robot; None: from names and types if unambiguous. datum: where the topics give
-    none; None: the first fix.
+    topics: None: from names and types. datum: where the topics give none; None: the first fix.
     """
     with opened_bag(path) as bag:
         chosen = topics or decide_topics(bag, path, robot)
@@ -344,7 +342,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
 
 
 def _first_fix(bag: Bag, topics: Topics) -> Datum | None:
-    """Datum at the first fix of any robot, rounded to 10⁻⁶ degrees."""
+    """Datum at the first fix, rounded to 10⁻⁶ degrees."""
     for record in _records(bag, {each.fixes for each in topics.robots.values()} - {""}):
         if isinstance(record, FixRecord) and record.degrees is not None:
             latitude, longitude = (round(each, 6) for each in record.degrees)

@@ -16,7 +16,7 @@ from teamslam.sim.datasets.tables import DatasetError
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A user's column: scale · number + offset, or without both its text."""
+    """User's column: scale · number + offset, or its text."""
 
     column: str
     scale: float = 1.0
@@ -24,7 +24,7 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Table: endings of the names of files joined side by side, and its columns.
+    """Endings of the names of files joined side by side, and columns.
 
     drop: by user column, texts of rows that are no measurements.
     """
@@ -39,7 +39,7 @@ Map = dict[str, Table]
 
 
 class ColumnMap(msgspec.Struct, frozen=True):
-    """Team's column map: tables of every robot, and those of single robots, which replace them."""
+    """Tables of every robot, and of single robots, which replace them."""
 
     shared: Map
     robots: dict[str, Map]
@@ -49,7 +49,7 @@ class ColumnMap(msgspec.Struct, frozen=True):
         return self.shared | self.robots.get(robot, {})
 
     def places_of(self, robot: str, path: Path | None) -> Mapping[str, str]:
-        """Place of a robot's tables in the map's file, by kind."""
+        """Place of each kind of table in the map's file."""
         own = self.robots.get(robot, {})
         return {
             kind: f"[robots.{robot}.{kind}] of {path}" if kind in own else f"[{kind}] of {path}"
@@ -110,7 +110,7 @@ def _check_tables(tables: Map, place: str) -> None:
 
 
 def map_columns(table: CsvTable, columns: Mapping[str, str | Column]) -> dict[str, list[str]]:
-    """Columns under our names, as text; raises DatasetError."""
+    """Columns under our names, as text."""
     found = {}
     for ours, theirs in columns.items():
         column = Column(theirs) if isinstance(theirs, str) else theirs

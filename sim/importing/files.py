@@ -34,10 +34,7 @@ QUATERNION = 8
 
 
 def read_files(paths: Sequence[Path], *, tum: bool) -> dict[str, CsvTable]:
-    """Read one robot's files by name; with `tum` a file in TUM's format is its odometry.
-
-    Raises DatasetError.
-    """
+    """Read one robot's files by name; with `tum` a file in TUM's format is its odometry."""
     files: dict[str, CsvTable] = {}
     for path in paths:
         poses = _tum_table(path)
@@ -58,11 +55,11 @@ def import_files(
     everyones: Collection[str] = (),
     places: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[RobotTables, list[str]]:
-    """Import one robot's tables from CSV files by a map; also returns notes on the files.
+    """Import one robot's tables by a map; also returns notes.
 
     everyones: file names of all robots; a table whose files only other robots have is omitted.
-    places: place of each kind's table in the map.
-    Raises DatasetError, also for an unused file that is probably an omitted table.
+    places: place of each kind's table in the map. Raises DatasetError, also for an unused file that
+    is probably an omitted table.
     """
     tables = RobotTables(robot)
     notes: list[str] = []
@@ -91,7 +88,7 @@ def import_files(
 def _refuse_second_robot(
     endings: Sequence[str], used: Collection[str], unused: Collection[str]
 ) -> None:
-    """Raise DatasetError for an unused file with the odometry's name after another prefix."""
+    """Refuse an unused file with the odometry's name after another prefix."""
     rest = {re.split("[_-]", n, maxsplit=1)[-1] for n in used if n.endswith(tuple(endings))}
     for name in unused:
         prefix, *behind = re.split("[_-]", name, maxsplit=1)
@@ -105,7 +102,7 @@ def _refuse_second_robot(
 
 
 def map_by_names(files: Mapping[str, CsvTable]) -> Map | None:
-    """Map of files whose names and columns are all ours; None: some are not."""
+    """Map of files whose names and columns are all ours, or None."""
     found: Map = {}
     for name, table in files.items():
         kind = Path(name).stem
@@ -175,7 +172,7 @@ def _unassigned(rows: CsvTable, table: Table) -> list[str]:
 
 
 def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) -> None:
-    """Raise DatasetError for an unused column that names several robots."""
+    """Refuse an unused column that names several robots."""
     if kind not in (*MEASURED, "truth"):
         return
     for column in _unassigned(rows, table):
@@ -191,7 +188,7 @@ def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) 
 
 
 def _convert_points(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
-    """Convert detections from points (ahead, left) to range and bearing."""
+    """Convert points (ahead, left) to range and bearing."""
     if not all(name in columns for name in POINTS):
         return columns
     x, y = (_numbers(columns.pop(name), name, table) for name in POINTS)
@@ -225,9 +222,7 @@ def _join_columns(tables: Sequence[CsvTable]) -> CsvTable:
 
 
 def trajectory(path: Path) -> list[tuple[str, ...]]:
-    """Rows (t, x, y, θ) of a CSV file with t_s,x_m,y_m,theta_rad or in TUM format; raises
-    DatasetError.
-    """
+    """Rows (t, x, y, θ) of a CSV file or in TUM's format."""
     table = _tum_table(path) or read_table(path, str(path), ("t_s", *POSES))
     if not table.has("t_s", *POSES):
         raise table.fault("expected the columns t_s,x_m,y_m,theta_rad, or TUM's format")
@@ -235,9 +230,9 @@ def trajectory(path: Path) -> list[tuple[str, ...]]:
 
 
 def _tum_table(path: Path) -> CsvTable | None:
-    """Read poses (t x y z qx qy qz qw) in TUM's format; None: another format.
+    """Poses (t x y z qx qy qz qw) in TUM's format, or None.
 
-    Heading is that of the pose's x axis. Raises DatasetError.
+    Heading is that of the pose's x axis.
     """
     rows: list[tuple[str, ...]] = []
     lines: list[int] = []

@@ -76,7 +76,7 @@ PREFIXES = ("odometry", "odom", "pose", "position", "robot", "base", "wheel", "t
 
 
 class _Guess(NamedTuple):
-    """Probable table of a file: our columns, and whether names match; a higher rank is better."""
+    """Probable table of a file; a higher rank is better."""
 
     file: str
     kind: str
@@ -86,7 +86,7 @@ class _Guess(NamedTuple):
 
 
 class _Proposed(NamedTuple):
-    """TOML text of a table, with KIND for its name, and its file."""
+    """TOML text of a table, with KIND for its name."""
 
     file: str
     text: str
@@ -103,10 +103,9 @@ Drops = Mapping[str, Mapping[str, str]]
 def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops = _NONE) -> str:
     """Propose a TOML map for the files of each robot.
 
-    A table that not all robots have alike, with `own` every table, is the robot's own,
-    `[robots.NAME.KIND]`. One file is the truth of one robot. A robot without odometry has the table
-    of the file that it should have. Missing and unassigned columns and files without a table are
-    comments.
+    A table that not all robots have alike, with `own` every table, is `[robots.NAME.KIND]`. One
+    file is the truth of one robot. A robot without odometry has the table of the file that it
+    should have. What is missing or not assigned is a comment.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
     _drop_shared_truth(robots, found, drops)
@@ -139,7 +138,7 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops 
 def _unassigned(
     kind: str, tables: Mapping[str, _Proposed], files: Files, text: str
 ) -> Sequence[str]:
-    """Columns of a table's file that neither this table, with its `drop`, nor another one has."""
+    """Columns that neither this table, with its `drop`, nor another one of its file has."""
     file = tables[kind].file
     texts = [text, *(each.text for each in tables.values() if each.file == file)]
     columns = files[file].columns if file in files else ()
@@ -162,8 +161,8 @@ def _text_of(table: _Proposed, drops: Mapping[str, str]) -> str:
 
 
 def drops_by_robot(files: Files) -> Drops:
-    """Lines for tables whose rows are of several robots, by a column that names them; empty if the
-    odometry has none.
+    """Lines for tables of several robots, by a column that names them; empty if the odometry has
+    none.
     """
     tables = _tables(files)[0]
     columns = {
@@ -196,7 +195,7 @@ def drops_by_robot(files: Files) -> Drops:
 
 
 def drop_line(column: str, texts: Sequence[str]) -> str:
-    """Line of a column map that drops the rows with these texts in a column."""
+    """Line of a map that drops the rows with these texts."""
     key = column if re.fullmatch(r"[A-Za-z0-9_-]+", column) else json.dumps(column)
     return f"drop = {{ {key} = {json.dumps(texts, ensure_ascii=False)} }}"
 
@@ -206,7 +205,7 @@ def _drop_shared_truth(
     found: Mapping[str, tuple[dict[str, _Proposed], list[str]]],
     drops: Drops,
 ) -> None:
-    """Replace the truth that several robots would have of one file's rows by a comment."""
+    """Replace a truth that several robots would have by a comment."""
     files = {
         robot: tables["truth"].file
         for robot, (tables, _) in found.items()
@@ -221,7 +220,7 @@ def _drop_shared_truth(
 
 
 def _add_odometry(found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]) -> str:
-    """Add the expected odometry of robots that have none; returns a comment for each."""
+    """Add the expected odometry of robots that have none; returns comments."""
     comments = ""
     models = {
         robot: tables["odometry"] for robot, (tables, _) in found.items() if "odometry" in tables
@@ -239,14 +238,11 @@ def _add_odometry(found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]) -
 
 
 class ProposalWrittenError(DatasetError):
-    """A proposal is written to the missing file that an option names; the text is the next step."""
+    """A proposal is written; the text is the next step."""
 
 
 def write_proposal(text: str, path: Path) -> ProposalWrittenError:
-    """Write a proposal to the missing file that an option names; returns the request to check it.
-
-    Raises DatasetError.
-    """
+    """Write a proposal to the missing file of an option; returns the request to check it."""
     try:
         path.write_text(text, "utf-8")
     except OSError as error:
@@ -263,12 +259,11 @@ def proposed_kinds(files: Files) -> set[str]:
 
 
 def split_by_robot(files: Files) -> dict[str, Files]:
-    """Files of each robot, if the first or last words of their names are the names of at least two
-    robots; else empty.
+    """Files of each robot by the first or last words of their names; empty for fewer than two
+    robots.
 
-    A robot has odometry and measurements; beside one, also a name with one of both in a file that
-    is called as that robot's. Other files with a robot's name in their own are this robot's; the
-    rest is every robot's.
+    A robot has odometry and measurements; beside one, also a name with one of both in a file called
+    as that robot's. Other files with a robot's name are this robot's; the rest is every robot's.
     """
     for position in (0, -1):
         words = {name: _words(name)[position] for name in files}
@@ -314,7 +309,7 @@ def _words(name: str) -> list[str]:
 
 
 def _tables(files: Files) -> tuple[dict[str, _Proposed], list[str]]:
-    """TOML text of each probable table, with KIND for its name; also returns missing columns."""
+    """Text of each probable table, with KIND for its name; also what is missing."""
     guesses: list[_Guess] = []
     lacking: list[str] = []
     for name, table in files.items():
@@ -343,7 +338,7 @@ def _tables(files: Files) -> tuple[dict[str, _Proposed], list[str]]:
 
 
 def _guesses(name: str, header: Sequence[str]) -> list[_Guess]:
-    """Table with most of these columns, then by file name; and truth, from reference columns."""
+    """Table with most of these columns, then by file name; and truth, of reference columns."""
     reference = [each for each in header if has_word(each, TRUTH_WORDS)]
     is_reference = has_word(Path(name).stem, TRUTH_WORDS)
     own = [each for each in header if each not in reference]
@@ -401,7 +396,7 @@ def _near(ours: str, header: Sequence[str]) -> str | None:
 
 
 def _without_unit(name: str) -> tuple[str, str]:
-    """Lower-case column name without unit, and the unit's factor."""
+    """Lower-case name without unit, and the unit's factor."""
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
     plain = re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
     for unit in sorted(UNITS, key=len, reverse=True):
@@ -420,7 +415,7 @@ def _join_words(name: str) -> str:
 
 
 def _clock(chosen: str, table: CsvTable) -> dict[str, str]:
-    """Time column with a scale, if its name has no unit and its numbers are no seconds."""
+    """Time column with a scale, if its numbers are no seconds."""
     cells = table.columns.get(chosen.strip('"'), [])
     try:
         largest = abs(float(cells[0]))

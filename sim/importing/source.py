@@ -59,8 +59,8 @@ HEAD = 64
 class Request:
     """Import request.
 
-    sources: files or folders. starts: pose and zero or two standard deviations by robot, "" for the
-    only one. truth: trajectory of the only robot. datum: origin of fixes; None: the first one.
+    starts: pose and zero or two standard deviations by robot, "" for the only one. truth:
+    trajectory of the only robot. datum: origin of fixes; None: the first one.
     """
 
     sources: Sequence[Path]
@@ -76,8 +76,8 @@ class Request:
 class Report:
     """Result of an import.
 
-    robots: names. notes: used and omitted files and rows. messages: number read from bags. tables:
-    of each robot, for files and bags.
+    notes: used and omitted files and rows. messages: number read from bags. tables: of each robot,
+    for files and bags.
     """
 
     robots: list[str]
@@ -87,7 +87,7 @@ class Report:
 
 
 def import_data(request: Request, folder: Path) -> Report:
-    """Write the data set into `folder`; raises DatasetError, LogError, ScenarioError."""
+    """Write the data set; raises DatasetError, LogError, ScenarioError."""
     source = request.sources[0]
     for path in request.sources:
         if not path.exists():
@@ -152,8 +152,8 @@ def _is_foreign(source: Path) -> bool:
 
 
 def _files_by_robot(request: Request) -> dict[str, list[Path]]:
-    """CSV files by robot: of a folder ("" if nothing names its robot), its sub-folders, or of each
-    given folder. Files beside the robots' folders are every robot's.
+    """CSV files by robot: of a folder ("" if nothing names its robot), its sub-folders, or each
+    given folder; files beside robots' folders are every robot's.
     """
     found: dict[str, list[Path]] = {}
     for source in request.sources:
@@ -183,7 +183,7 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
 
 
 def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) -> Report:
-    """Import CSV files of each robot; those of "" are of the robots that map or names have."""
+    """Import CSV files; those of "" are of the robots that map or names have."""
     is_given = request.columns is not None and request.columns.exists()
     read = {robot: read_files(of, tum=not is_given) for robot, of in paths.items()}
     columns = None
@@ -213,7 +213,7 @@ def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
 def _files_by_map(
     read: Mapping[str, Mapping[str, CsvTable]], columns: ColumnMap, path: Path
 ) -> Mapping[str, Mapping[str, CsvTable]]:
-    """Files by robot; those of "" by the map; raises DatasetError."""
+    """Files by robot; those of "" by the map."""
     if "" not in read:
         for robot in columns.robots:
             if robot not in read:
@@ -240,7 +240,7 @@ def _question(
     request: Request,
     folder: Path,
 ) -> DatasetError:
-    """Error that proposes a map; names of files `of_all`, or a column, tell their robots."""
+    """Error that proposes a map."""
     split, drops = split_by_robot(of_all), drops_by_robot(of_all)
     by_column = dict.fromkeys(drops, of_all)
     proposed = propose_map(split or by_column or robots, drops={} if split else drops)
@@ -264,7 +264,7 @@ def _question(
 
 
 def proposal(path: Path) -> str:
-    """Describe a bag's topics, with a proposed assignment file; empty for other paths."""
+    """Describe a bag's topics, with a proposed assignment; empty for other paths."""
     if not is_bag(path) or is_own_log(path):
         return ""
     try:
@@ -279,7 +279,7 @@ def is_own_log(path: Path) -> bool:
 
 
 def is_ros2_bag(path: Path) -> bool:
-    """Whether a path is a bag; an MCAP file is one by its profile."""
+    """Whether a path is a bag, an MCAP file by its profile."""
     return is_bag(path) and (path.suffix != ".mcap" or _is_mcap_of(path, ROS2_PROFILE))
 
 
@@ -358,7 +358,7 @@ def _written(
 
 
 def _refuse_shared_truth(tables: Sequence[RobotTables]) -> None:
-    """Raise DatasetError for rows of one file that are the true path of two robots."""
+    """Refuse rows of one file that are the true path of two robots."""
     of: dict[tuple[str, tuple[int, ...]], str] = {}
     for each in tables:
         if (truth := each.sources.get("truth")) is None or not len(truth):
@@ -397,7 +397,7 @@ def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Pa
 
 
 def robot_entry(robot: Mapping[str, Any]) -> str:
-    """TOML text of a robot's entry: its name, the places of its sensor and antenna."""
+    """TOML text of a robot's name, and the places of sensor and antenna."""
     places = [
         f"{part}.{name} = {place}\n"
         for part in ("sensor", "gnss")
@@ -410,7 +410,7 @@ LANDMARKS = "landmarks.csv"
 
 
 def takes_robot(folder: Path, robot: str) -> bool:
-    """Whether a folder is a data set of sub-folders, and none for this robot."""
+    """Whether a folder is a data set of sub-folders without this robot."""
     try:
         robots = robots_of(str(folder))
     except DatasetError:
@@ -419,7 +419,7 @@ def takes_robot(folder: Path, robot: str) -> bool:
 
 
 def add_robot(request: Request, folder: Path) -> Report:
-    """Import one robot into a data set, whose other files and datum stay; raises DatasetError."""
+    """Import one robot into a data set, whose other files and datum stay."""
     assert request.robot is not None
     with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}-") as place:
         added = Path(place)
@@ -451,10 +451,7 @@ def add_robot(request: Request, folder: Path) -> Report:
 
 
 def _with_robot(folder: Path, added: Path, robot: str) -> str:
-    """Text of the data set's scenario with the added robot; empty if it needs no change.
-
-    Raises DatasetError.
-    """
+    """Text of the scenario with the added robot; empty if it needs no change."""
     own = _document(added / SCENARIO)
     text = (folder / SCENARIO).read_text("utf-8") if (folder / SCENARIO).exists() else ""
     base = _document(folder / SCENARIO)
@@ -485,8 +482,8 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def check_sources(robots: Iterable[RobotTables]) -> None:
-    """Convert the users' tables as a data set's are; raises the DatasetError of the first fault,
-    with the user's file, its line and the entry of the map of columns.
+    """Convert the users' tables as a data set's are, so that the first fault names file, line and
+    entry of the map.
     """
     for robot in robots:
         tables = {kind: table for kind, table in robot.sources.items() if len(table)}

@@ -14,9 +14,8 @@ from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
 class RobotTables:
     """Rows of one robot's tables.
 
-    columns: of tables that choose their columns. mount: sensor pose (x, y, yaw) on the base.
-    antenna: place (ahead, left) of the GNSS antenna on the base. sources: tables as read from the
-    user's files, under our column names.
+    mount: sensor pose (x, y, yaw) on the base. antenna: place (ahead, left) on the base. sources:
+    tables of the user's files, under our column names.
     """
 
     robot: str
@@ -27,7 +26,7 @@ class RobotTables:
     sources: dict[str, CsvTable] = field(default_factory=dict)
 
     def add(self, table: str, columns: Sequence[str], row: Row) -> None:
-        """Append a row; columns of only some rows are empty in the others."""
+        """Append a row; columns of only some rows are empty in others."""
         known = self.columns.setdefault(table, columns)
         if len(columns) > len(known):
             self.columns[table] = columns
@@ -65,7 +64,7 @@ class RobotTables:
                     self.add(table, ("t_s", column, *POINTS), (time, name, *point))
 
     def start(self, pose: Sequence[float], sigmas: Sequence[float] = ()) -> None:
-        """Set the initial pose; sigmas: standard deviations (position [m], heading [rad])."""
+        """Set the initial pose; sigmas: (position [m], heading [rad])."""
         row: list[object] = list(pose)
         columns = [*POSES]
         if sigmas:
@@ -75,7 +74,7 @@ class RobotTables:
         self.columns["start"], self.rows["start"] = columns, [row]
 
     def write(self, folder: Path) -> None:
-        """Write the tables into a folder of the robot's name, true landmarks beside it."""
+        """Write the tables, true landmarks beside the robot's folder."""
         place = folder / self.robot
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():

@@ -1,4 +1,4 @@
-"""Words in file, column and topic names, and the sources they indicate."""
+"""Words in names of files, columns and topics."""
 
 import re
 
@@ -20,11 +20,11 @@ ROBOT_COLUMN = re.compile(
 
 
 def names_robot(column: str) -> bool:
-    """Whether a column is named as one of robots' names."""
+    """Whether a column is called as one of robots' names."""
     return ROBOT_COLUMN.fullmatch(re.sub(r"[^a-z0-9]+", "_", column.lower())) is not None
 
 
 def has_word(name: str, words: tuple[str, ...]) -> bool:
-    """Whether a name has one of these words between marks or capital letters."""
+    """Whether a name has such a word between marks or capitals."""
     parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
     return not set(re.split(r"[^a-z]+", parts)).isdisjoint(words)

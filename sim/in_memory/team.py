@@ -31,7 +31,7 @@ _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
 
 class Link:
-    """Delivery of messages to a node at their arrival times, liveliness first."""
+    """Delivery to a node at arrival times, liveliness first."""
 
     def __init__(self, arrival_ns: Callable[[Sample, int], int] | None = None) -> None:
         self._arrival_ns = arrival_ns
@@ -39,12 +39,12 @@ class Link:
         self._sent = 0
 
     def say(self, at_ns: int, message: m.Liveliness) -> None:
-        """Deliver a node's liveliness token at this time."""
+        """Deliver a liveliness token at this time."""
         sample = Sample(ch.ALIVE.key(message.node), encoded(message), 0, 0, 0)
         self._hold(at_ns, sample, sent=False)
 
     def arrived(self, samples: Sequence[Sample], now_ns: int) -> list[Sample]:
-        """Messages that have arrived by now, given those sent since the last call."""
+        """Messages that have arrived by now."""
         if self._arrival_ns is None:
             return list(samples)
         for sample in samples:
@@ -60,7 +60,7 @@ class Link:
 
     @property
     def next_ns(self) -> int | None:
-        """Arrival time of the next message in flight."""
+        """Arrival of the next message in flight."""
         return self._in_flight[0][0] if self._in_flight else None
 
 
@@ -77,9 +77,8 @@ class Partition:
 class Conditions:
     """Conditions of a team's links.
 
-    loss: probability per transmission of a submap to the centre. delay_ns: of submaps to the
-    centre. down_ns: interval without a centre; the next one starts empty and requests everything
-    from the robots.
+    loss: probability per transmission of a submap. delay_ns: of submaps to the centre. down_ns:
+    interval without a centre; the next one starts empty.
     """
 
     delay_ns: int = 0
@@ -142,7 +141,6 @@ class Conditions:
 def _behind(
     cuts: Sequence[Partition], now_ns: int, sample: Sample, channels: Sequence[ch.Channel]
 ) -> int:
-    """`now_ns`, or the end of the partitions that a message crosses at that time."""
     found = ch.channel_of(sample.key)
     if found is None or found[0] not in channels:
         return now_ns
@@ -163,7 +161,7 @@ SHARED = 16
 
 @runtime_checkable
 class World(Protocol):
-    """A publisher of measurements: a scenario's world, or a log's."""
+    """Publisher of measurements."""
 
     @property
     def listens(self) -> tuple[ch.Channel, ...]:
@@ -171,13 +169,13 @@ class World(Protocol):
 
     @property
     def now_ns(self) -> int:
-        """Team time: the stamp up to which it has published."""
+        """Stamp up to which it has published."""
 
     def begin(self) -> list[Outgoing]:
         """First messages."""
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """Next measurements; none while it waits or after its end."""
+        """Next measurements, if any."""
 
     def handle(self, message: m.Message) -> list[Outgoing]:
         """Handle one message."""
@@ -185,7 +183,7 @@ class World(Protocol):
 
 @dataclass
 class _Seat:
-    """A node, its bus, and the link that delivers the others' messages to it."""
+    """A node, its bus, and the link to it."""
 
     node: World | RobotNode | CentralNode
     bus: MemoryBus
@@ -218,7 +216,7 @@ def run_team(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
-    """Run the team to its final map; yield a recorder's samples, in order."""
+    """Run to the final map; yield a recorder's samples, in order."""
     expected = expected_nodes([config.id for config in scenario.robots], recorder=False)
     announced = announce_configuration("world", 0, 0, scenario)
     world = WorldNode(
@@ -234,10 +232,7 @@ def run_nodes(
     robot: Callable[[RobotConfig, Exchange], RobotNode] = robot_node,
     central: Callable[[CentralConfig, list[str]], CentralNode] = make_centre,
 ) -> Iterator[Sample]:
-    """Run the scenario's robots and centre in a world until no message is in flight.
-
-    conditions: of links and centre; None: messages arrive at once.
-    """
+    """Run robots and centre in a world until no message is in flight."""
     conditions = Conditions() if conditions is None else conditions
     network = MemoryNetwork()
     recorder = MemoryBus(network)
@@ -315,7 +310,7 @@ def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _
 
 
 def final_map(samples: list[Sample]) -> m.FusedMap:
-    """The team's final map among the samples of a run."""
+    """Final map among a run's samples."""
     for sample in reversed(samples):
         if sample.key == ch.FINAL_MAP.key():
             _, _, message = opened(sample)

@@ -3,31 +3,18 @@
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre
-from teamslam.sim.launch.processes import Starter, Used
-from teamslam.sim.launch.supervision import (
-    Ended,
-    Supervised,
-    end_all,
-    failure,
-    lacking_in,
-    names_only,
-    supervise,
-)
+from teamslam.sim.launch.processes import Ended, Used, end_all, environment_of
+from teamslam.sim.launch.supervision import Supervised, failure, lacking_in, names_only, supervise
 from teamslam.sim.launch.watch import COMPARED, Watch
 from teamslam.sim.scenarios.scenario import Scenario, dumps
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import BusError
 from teamslam.team.wire.zenoh.bus import ZenohBus
-
-if TYPE_CHECKING:
-    from teamslam.team.keys.credentials import Credentials
-    from teamslam.team.peers.proofs import Signs
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,17 +34,17 @@ class Plan:
 
     @property
     def door(self) -> list[str]:
-        """Certificate option of every process; empty without keys."""
+        """Certificate option of every process."""
         return [] if self.keys is None else ["--keys", str(self.keys)]
 
     def maps_of(self, node: str) -> list[str]:
-        """Options of the saved maps that a peer or centre loads."""
+        """Options of the saved maps of a peer or centre."""
         if not (self.scenario.peers or node == "central"):
             return []
         return [word for path in self.maps for word in ("--map", str(path.resolve()))]
 
     def set_file(self, node: str) -> Path:
-        """File of a node's set of submaps; node "*": pattern of all."""
+        """File of a node's set; "*": pattern of all."""
         return self.folder / f"{node}.set"
 
     def stores(self, node: str) -> list[str]:
@@ -82,7 +69,7 @@ REFUSED = 2
 
 
 class LaunchError(RuntimeError):
-    """The team could not start or end well."""
+    """The team did not start."""
 
 
 @dataclass
@@ -90,7 +77,7 @@ class Outcome:
     """Result of a launch.
 
     deaths: processes killed at the end and not restarted; no failure if map and log are whole.
-    used: resources by process over all its lives.
+    used: resources over all lives.
     """
 
     log: Path
@@ -105,23 +92,38 @@ class Outcome:
     end_reason: str = ""
 
 
-def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outcome:
+def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
     """Start router, recorder, world, centre and robots; return when all have ended.
 
-    `show` repeatedly receives the team's state. A dead process is restarted or given up. Raises
-    BusError if the router cannot listen, LaunchError if it does not start. SIGINT and SIGTERM end
-    every process and raise KeyboardInterrupt.
+    A dead process is restarted or given up. Raises BusError if the router cannot listen,
+    LaunchError if it does not start. SIGINT and SIGTERM end every process and raise
+    KeyboardInterrupt.
     """
-    began = time.monotonic()
+    began, environment = time.monotonic(), environment_of(time.time_ns())
     resolved = plan.folder / "scenario.json"
     resolved.write_text(dumps(plan.scenario))
-    with _interruptible(), _services() as services:
-        router = _start_router(plan, services, starter)
+    services: list[Supervised] = []
+
+    def start(name: str, words: list[str]) -> Supervised:
+        services.append(Supervised(name, words, plan.folder, environment))
+        return services[-1]
+
+    def end() -> list[Ended]:
+        return end_all([service.child for service in services])
+
+    with _interruptible(), ExitStack() as running:
+        running.callback(end)
+        insecure = ["--insecure"] if plan.insecure else []
+        router = start("router", ["router", "--listen", plan.listen, *plan.door, *insecure])
         ids = tuple(robot.id for robot in plan.scenario.robots)
         drivers = ids if plan.scenario.is_live else None
         watch = Watch(began=began, robots=ids, drivers=drivers)
         team = plan.scenario.team
-        own = None if plan.keys is None else _own_keys(plan.keys, team)
+        own = None
+        if plan.keys is not None:
+            from teamslam.team.keys.credentials import credentials_of
+
+            own = credentials_of(plan.keys, "operator", team)
         door = "".join(f" {word}" for word in plan.door)
         endpoint, connected = enter_team(
             router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES)
@@ -130,23 +132,22 @@ def launch(plan: Plan, starter: Starter, show: Callable[[Watch], None]) -> Outco
         at = f'team="{team}", connect="{endpoint}"'
         watch.call = at if plan.keys is None else f'{at}, keys="{plan.keys}"'
         with connected as bus:
-            bus.subscribe(ch.STATUS)
-            bus.subscribe(ch.FUSED_MAP)
-            bus.subscribe(ch.FINAL_MAP)
-            bus.subscribe(ch.FAULT)
+            for channel in (ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP, ch.FAULT, *COMPARED):
+                bus.subscribe(channel)
             if plan.scenario.peers:
                 watch.peers = frozenset(ids)
                 watch.centre = PeersAsCentre(watch.peers)
                 for channel in LISTENS:
                     bus.subscribe(channel)
                 bus.watch_alive("central")
-                watch.signer = None if own is None else _signer(own)
-            for channel in COMPARED:
-                bus.subscribe(channel)
-            for name, arguments in _commands(plan, resolved, endpoint):
-                services.append(Supervised(name, arguments, plan.folder, starter))
+            if plan.scenario.peers and own is not None:
+                from teamslam.team.keys.signing import Signer
+
+                watch.signer = Signer(own)
+            for name, words in _commands(plan, resolved, endpoint):
+                start(name, words)
             supervise(services, bus, watch, show, plan.end_silent_s)
-        ended = end_all([service.child for service in services])
+        ended = end()
     lacks = lacking_in(watch)
     wrong = [
         each
@@ -182,37 +183,8 @@ def _interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-@contextmanager
-def _services() -> Iterator[list[Supervised]]:
-    services: list[Supervised] = []
-    try:
-        yield services
-    finally:
-        end_all([service.child for service in services])
-
-
-def _start_router(plan: Plan, services: list[Supervised], starter: Starter) -> Supervised:
-    door = [*plan.door, *(["--insecure"] if plan.insecure else [])]
-    command = ["router", "--listen", plan.listen, *door]
-    service = Supervised("router", command, plan.folder, starter)
-    services.append(service)
-    return service
-
-
-def _own_keys(folder: Path, team: str) -> "Credentials":
-    from teamslam.team.keys.credentials import credentials_of
-
-    return credentials_of(folder, "operator", team)
-
-
-def _signer(own: "Credentials") -> "Signs":
-    from teamslam.team.keys.signing import Signer
-
-    return Signer(own)
-
-
 def enter_team(router: Supervised, enter: Callable[[str], ZenohBus]) -> tuple[str, ZenohBus]:
-    """Router's endpoint, and this process's bus there.
+    """Router's endpoint, and a bus there.
 
     A router killed meanwhile is restarted; its own refusal is raised.
     """

@@ -38,7 +38,7 @@ def _count_consumed(watch: Watch) -> tuple[float, float]:
 
 
 def done(watch: Watch) -> float:
-    """Share of the measurements that the robots consumed."""
+    """Consumed share of the measurements."""
     taken, total = _count_consumed(watch)
     return taken / total if total else 0.0
 
@@ -51,8 +51,7 @@ def is_live(watch: Watch) -> bool:
 def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
     """Failures and node warnings; absent nodes after PATIENCE_S only.
 
-    During the start only the world's warning is given. silent_s: age [s] beyond which a node's
-    warning is dropped, as it may no longer hold; 0: never.
+    silent_s: age [s] beyond which a warning is dropped; 0: never.
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
         return list(watch.failures)
@@ -74,7 +73,7 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
 
 
 def starting(watch: Watch) -> str:
-    """Number of started robots and names of the others."""
+    """Number of started robots, and the others."""
     missing = watch.missing_robots
     started = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
     if not missing:
@@ -84,7 +83,7 @@ def starting(watch: Watch) -> str:
 
 
 def share(watch: Watch) -> str:
-    """Progress as text; the total is unknown for drivers."""
+    """Progress as text."""
     if not is_live(watch):
         return f"{done(watch):.0%}"
     taken, total = _count_consumed(watch)
@@ -92,7 +91,7 @@ def share(watch: Watch) -> str:
 
 
 def times(watch: Watch, world: m.Status) -> str:
-    """Describe the team time of the map, and of a world far ahead."""
+    """Describe the map's team time, and a world far ahead."""
     ahead_s = _behind_s(watch, world)
     if is_live(watch) or ahead_s < AHEAD_S:
         return team_time(world)
@@ -112,7 +111,7 @@ def unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
 
 
 def consistency(watch: Watch) -> str:
-    """Describe the consistency monitor's figures; with truth, the landmarks' coverage."""
+    """Describe the monitor's figures; with truth, the coverage."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
     parts = [
@@ -155,7 +154,7 @@ def show_live(title: str) -> Iterator[Callable[[Watch], None]]:
 
 
 class _Lines:
-    """Plain lines: one every LINE_S, and every warning once."""
+    """Plain lines: one every LINE_S, every warning once."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -318,7 +317,7 @@ def _table(
 
 
 def _peer_cells(robot: str, statuses: Mapping[str, m.Status]) -> list[str]:
-    """Share of the set, age of the newest submap of the others, robots with the same set."""
+    """Share of the set, age of the others' newest submap, robots with the same set."""
     figures = statuses[f"robot/{robot}"].figures
     sets = [status.figures.get("set_submaps", 0.0) for status in statuses.values()]
     newest = {

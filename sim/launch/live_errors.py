@@ -24,12 +24,12 @@ class _Robot:
     team_ns: int = -1
 
     def begin_again(self, *, given_map: bool) -> None:
-        """Discard poses and errors before a change of kind or frame."""
+        """Discard poses before a change of kind or frame."""
         self.given_map, self.tally = given_map, NeesTally()
         self.errors.forget_poses()
 
     def judge(self) -> None:
-        """Compare every pose up to the newest truth; discards used truth."""
+        """Compare poses up to the newest truth."""
         if (found := self.errors.known()) is not None:
             self.tally.take(found.nees, 3)
             self.errors.forget(int(found.stamps_ns[-1]))
@@ -39,7 +39,7 @@ class _Robot:
 class LiveErrors:
     """Errors of a team so far.
 
-    landmarks: of the newest fused map, unaligned, each landmark in its own covariance.
+    landmarks: of the newest map, unaligned, each in its own covariance.
     """
 
     landmarks: NeesTally = field(default_factory=NeesTally)
@@ -48,7 +48,7 @@ class LiveErrors:
     _frames: TruthFrames = field(default_factory=TruthFrames)
 
     def of(self, robot: str) -> NeesTally:
-        """Errors of a robot's online poses, given the team's map if there are any."""
+        """Errors of online poses, given the team's map if there are any."""
         return self._robots[robot].tally if robot in self._robots else NeesTally()
 
     def wants(self, channel: ch.Channel, robot: str, sample: Sample) -> bool:

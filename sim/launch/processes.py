@@ -1,6 +1,8 @@
-"""Start a team's processes, and measure the resources that they use."""
+"""Processes of a team: start, end, output, resources."""
 
+import math
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -11,6 +13,7 @@ from pathlib import Path
 
 from teamslam.team.end_query import SINCE
 from teamslam.team.shell import PARENT
+from teamslam.team.wire.text import one_line
 
 # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
 PROGRAM = (sys.executable, "-P", "-m", "teamslam")
@@ -20,34 +23,74 @@ ONE_THREAD = dict.fromkeys(
 """Environment that gives linear algebra one thread."""
 LOOK_S = 0.005
 """Time [s] between checks of an ending process."""
+LAST_LINES = 12
+GRACE_S = 5.0
+"""Time [s] for a requested stop."""
 
 
 @dataclass(frozen=True)
 class Used:
-    """Resources of a process: CPU, peak resident set, final share of memory; None: unknown.
-
-    A page shared by n processes counts 1/n.
-    """
+    """CPU, peak resident set, final share of memory (a page of n processes counts 1/n)."""
 
     cpu_s: float = 0.0
     peak_rss_mb: float = 0.0
     pss_mb: float | None = None
 
     def and_later(self, later: "Used") -> "Used":
-        """Resources of two consecutive lives of a process, this one first."""
+        """Resources of two consecutive lives."""
         pss_mb = self.pss_mb if later.pss_mb is None else later.pss_mb
         peak_rss_mb = max(self.peak_rss_mb, later.peak_rss_mb)
         return Used(self.cpu_s + later.cpu_s, peak_rss_mb, pss_mb)
 
 
-class Process:
-    """Child of this process; used: resources, with the last memory measurement."""
+@dataclass(frozen=True)
+class Ended:
+    """End of a process: exit status (negative: signal), last lines; asked: on request."""
 
-    def __init__(self, started: "subprocess.Popen[bytes]") -> None:
-        self.pid = started.pid
+    name: str
+    pid: int
+    exit: int
+    last_lines: tuple[str, ...]
+    asked: bool
+    used: Used
+
+    @property
+    def how(self) -> str:
+        """The end as text."""
+        if self.exit < 0:
+            return f"was ended by {signal.Signals(-self.exit).name}"
+        return f"ended with exit status {self.exit}"
+
+
+class Child:
+    """Process in its own session, with its own output file; life: number of earlier starts."""
+
+    def __init__(
+        self,
+        name: str,
+        words: Sequence[str],
+        folder: Path,
+        environment: Mapping[str, str],
+        life: int = 0,
+    ) -> None:
+        self.name = name
+        self.started = time.monotonic()
         self.used = Used()
+        self.output = folder / f"{name}.log"
+        self._asked = False
         self._status: int | None = None
-        self._started = started
+        with self.output.open("ab" if life else "wb") as file:
+            self._before = self.output.stat().st_size
+            self._process = subprocess.Popen(  # noqa: S603 - our own program, no shell
+                [*PROGRAM, *words],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
+        self.pid = self._process.pid
+        self.measure()  # a short run may end before the next measurement
 
     @property
     def exit(self) -> int | None:
@@ -55,14 +98,13 @@ class Process:
         if self._status is None:
             pid, status, used = os.wait4(self.pid, os.WNOHANG)
             if pid:
-                self._status = os.waitstatus_to_exitcode(status)
+                self._status = self._process.returncode = os.waitstatus_to_exitcode(status)
                 # Bytes on macOS, kilobytes elsewhere. The peak includes that of the starting
                 # program.
                 most_mb = used.ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
                 cpu_s = used.ru_utime + used.ru_stime
                 peak_rss_mb = self.used.peak_rss_mb or most_mb
                 self.used = replace(self.used, cpu_s=cpu_s, peak_rss_mb=peak_rss_mb)
-                self._started.returncode = self._status
         return self._status
 
     def measure(self) -> None:
@@ -76,42 +118,75 @@ class Process:
         lines = Path(f"/proc/{self.pid}/{file}").read_text().splitlines()
         return int(next(line for line in lines if line.startswith(word)).split()[1])
 
-    def wait(self, timeout_s: float) -> bool:
-        """Whether it ends within this time."""
-        deadline = time.monotonic() + timeout_s
+    @property
+    def is_stopped(self) -> bool:
+        """Whether it is stopped (SIGSTOP)."""
+        return self._state in ("T", "t")
+
+    @property
+    def is_computing(self) -> bool:
+        """Whether it is running or runnable."""
+        return self._state == "R"
+
+    @property
+    def _state(self) -> str:
+        try:
+            return Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()[0]
+        except (OSError, IndexError):
+            return ""
+
+    def kill(self) -> None:
+        """End it at once, even if stopped."""
+        if self.exit is None:
+            os.kill(self.pid, signal.SIGKILL)
+
+    def stop(self) -> None:
+        """Request its end."""
+        if self.exit is None:
+            self._asked = True
+            os.kill(self.pid, signal.SIGTERM)
+
+    def end(self, deadline: float) -> Ended:
+        """Wait until `deadline` (monotonic), then end it."""
         while self.exit is None:
             if time.monotonic() >= deadline:
-                return False
+                self.kill()
+                deadline = math.inf
             time.sleep(LOOK_S)
-        return True
+        return self.ended()
 
-    def signal(self, number: int) -> None:
-        """Send a signal unless it has ended."""
-        if self.exit is None:
-            os.kill(self.pid, number)
+    def ended(self) -> Ended:
+        """How it ended; call after its end."""
+        status = self.exit
+        assert status is not None
+        asked = self._asked and status != -signal.SIGKILL
+        return Ended(self.name, self.pid, status, self.last_lines(), asked, self.used)
+
+    def last_lines(self) -> tuple[str, ...]:
+        """Last lines of its output."""
+        text = self.output.read_bytes()[self._before :].decode("utf-8", "replace")
+        return tuple(one_line(line) for line in text.splitlines()[-LAST_LINES:])
 
 
-class Starter:
-    """Starter of the processes of one run.
-
-    since_ns: beginning of the run, for a child restarted after its end.
+def environment_of(since_ns: int) -> dict[str, str]:
+    """Environment of a run's processes; since_ns: its beginning, for a child restarted after its
+    end.
     """
-
-    def __init__(self, since_ns: int) -> None:
-        self._environment = _environment(os.environ, since_ns)
-
-    def start(self, words: Sequence[str], output: int) -> "subprocess.Popen[bytes]":
-        """Start `teamslam WORDS` in its own session; output: descriptor of output and errors."""
-        return subprocess.Popen(  # noqa: S603 - our own program, no shell
-            [*PROGRAM, *words],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=self._environment,
-            start_new_session=True,
-        )
-
-
-def _environment(mine: Mapping[str, str], since_ns: int) -> dict[str, str]:
     tied = {PARENT: str(os.getpid()), SINCE: str(since_ns), "PYTHONUNBUFFERED": "1"}
-    return {**mine, **ONE_THREAD, **tied}
+    return {**os.environ, **ONE_THREAD, **tied}
+
+
+def end_all(children: Sequence[Child]) -> list[Ended]:
+    """End nodes, then the recorder, then the router; kill those that do not stop."""
+    ended = {}
+    for group in (
+        [c for c in children if c.name not in ("recorder", "router")],
+        [c for c in children if c.name == "recorder"],
+        [c for c in children if c.name == "router"],
+    ):
+        for child in group:
+            child.stop()
+        deadline = time.monotonic() + GRACE_S
+        for child in group:
+            ended[child.name] = child.end(deadline)
+    return [ended[child.name] for child in children]

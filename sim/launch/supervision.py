@@ -1,134 +1,43 @@
 """Supervise a team's processes: restart dead ones, give up those without progress.
 
 Without recorder or viewer the team continues, and the run fails at its end. A robot given up is
-named as lost in the final map. Without router, world or centre the run ends; peers need no centre.
+lost in the final map. Without router, world or centre the run ends; peers need no centre.
 """
 
 import math
-import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from teamslam.central.desk.orders import publish_order
-from teamslam.sim.launch.processes import Process, Starter, Used
+from teamslam.sim.launch.processes import Child, Ended, Used
 from teamslam.sim.launch.watch import TURN_S, Watch
 from teamslam.team.shell import describe_missing
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, BusError, Outgoing
-from teamslam.team.wire.text import one_line
 
-LAST_LINES = 12
-GRACE_S = 5.0
-"""Time [s] for a requested stop."""
 FRUITLESS = 5
 """Consecutive deaths without progress before a process is given up."""
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 """Longest wait [s] before a restart."""
-_PROC = Path("/proc")
-
-
-@dataclass(frozen=True)
-class Ended:
-    """End of a process: exit status (negative: signal) and last lines.
-
-    asked: it stopped on request. used: its resources.
-    """
-
-    name: str
-    pid: int
-    exit: int
-    last_lines: tuple[str, ...]
-    asked: bool
-    used: Used
-
-    @property
-    def how(self) -> str:
-        """The end as text."""
-        if self.exit < 0:
-            return f"was ended by {signal.Signals(-self.exit).name}"
-        return f"ended with exit status {self.exit}"
-
-
-class Child(Process):
-    """A `teamslam …` process with its own output file."""
-
-    def __init__(
-        self, name: str, arguments: Sequence[str], folder: Path, starter: Starter, life: int = 0
-    ) -> None:
-        self.name = name
-        self.started = time.monotonic()
-        self._asked = False
-        self.output = folder / f"{name}.log"
-        with self.output.open("ab" if life else "wb") as file:
-            self._before = self.output.stat().st_size
-            super().__init__(starter.start(arguments, file.fileno()))
-        # A short run may end before the next measurement.
-        self.measure()
-
-    @property
-    def is_stopped(self) -> bool:
-        """Whether the process is stopped (SIGSTOP), as far as reported."""
-        return self._state in ("T", "t")
-
-    @property
-    def is_computing(self) -> bool:
-        """Whether the process is running or runnable, as far as reported."""
-        return self._state == "R"
-
-    @property
-    def _state(self) -> str:
-        try:
-            return (_PROC / str(self.pid) / "stat").read_text().rpartition(")")[2].split()[0]
-        except (OSError, IndexError):
-            return ""
-
-    def kill(self) -> None:
-        """End it at once, even if stopped."""
-        self.signal(signal.SIGKILL)
-
-    def stop(self) -> None:
-        """Request its end."""
-        if self.exit is None:
-            self._asked = True
-            self.signal(signal.SIGTERM)
-
-    def end(self, deadline: float) -> Ended:
-        """Wait until `deadline` (monotonic), then end it; return how it ended."""
-        while not self.wait(max(0.0, deadline - time.monotonic())):
-            self.kill()
-            deadline = math.inf
-        return self.ended()
-
-    def ended(self) -> Ended:
-        """How it ended; call after its end."""
-        status = self.exit
-        assert status is not None
-        asked = self._asked and status != -signal.SIGKILL
-        return Ended(self.name, self.pid, status, self.last_lines(), asked, self.used)
-
-    def last_lines(self) -> tuple[str, ...]:
-        """Last lines of its output."""
-        text = self.output.read_bytes()[self._before :].decode("utf-8", "replace")
-        return tuple(one_line(line) for line in text.splitlines()[-LAST_LINES:])
 
 
 @dataclass
 class Supervised:
-    """Process restarted by the same command on death, after growing waits.
+    """Process restarted by the same command, after growing waits.
 
-    Given up after FRUITLESS deaths in a row without progress. reached: progress at its last death.
-    ended_s: detection of its end (monotonic). used: resources of earlier lives.
+    Given up after FRUITLESS deaths without progress. reached: progress at its last death. ended_s:
+    detection of its end (monotonic). used: resources of earlier lives.
     """
 
     name: str
     arguments: list[str]
     folder: Path
-    starter: Starter
+    environment: Mapping[str, str]
     restarts: int = 0
     fruitless: int = 0
     reached: float = -1.0
@@ -140,7 +49,10 @@ class Supervised:
     child: Child = field(init=False)
 
     def __post_init__(self) -> None:
-        self.child = Child(self.name, self.arguments, self.folder, self.starter)
+        self.child = self._start()
+
+    def _start(self) -> Child:
+        return Child(self.name, self.arguments, self.folder, self.environment, self.restarts)
 
     @property
     def is_watched(self) -> bool:
@@ -153,7 +65,7 @@ class Supervised:
         return time.monotonic() - self.ended_s >= time_s
 
     def died(self, reached: float) -> None:
-        """Schedule a restart after a death, or give the process up."""
+        """Schedule a restart, or give the process up."""
         self.fruitless = 1 if reached > self.reached else self.fruitless + 1
         self.reached = max(self.reached, reached)
         if self.fruitless >= FRUITLESS:
@@ -168,23 +80,9 @@ class Supervised:
             self.due = self.ended_s = None
             self.restarts += 1
             self.used = self.used.and_later(self.child.end(0.0).used)
-            self.child = Child(self.name, self.arguments, self.folder, self.starter, self.restarts)
-
-
-def end_all(children: Sequence[Child]) -> list[Ended]:
-    """Request all to stop and end the rest: nodes, then the recorder, then the router."""
-    ended = {}
-    for group in (
-        [c for c in children if c.name not in ("recorder", "router")],
-        [c for c in children if c.name == "recorder"],
-        [c for c in children if c.name == "router"],
-    ):
-        for child in group:
-            child.stop()
-        deadline = time.monotonic() + GRACE_S
-        for child in group:
-            ended[child.name] = child.end(deadline)
-    return [ended[child.name] for child in children]
+            self.child = Child(
+                self.name, self.arguments, self.folder, self.environment, self.restarts
+            )
 
 
 SILENT_S = 10.0
@@ -292,7 +190,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
 
 
 class Leaving:
-    """End of a run: processes leave, and the recorder receives their last messages."""
+    """End of a run, when processes leave."""
 
     def __init__(self) -> None:
         self._reached = (-1, -1.0)
@@ -320,7 +218,7 @@ def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
 
 
 class Memory:
-    """Memory shares of the processes, measured periodically and at the final map."""
+    """Periodic measurement of memory, the last at the final map."""
 
     def __init__(self) -> None:
         self._due = 0.0
@@ -336,7 +234,7 @@ class Memory:
 
 
 class Silence:
-    """Report of connected processes that send nothing."""
+    """Report of processes that send nothing."""
 
     def __init__(self, end_s: float | None) -> None:
         self._end_s = end_s
@@ -402,12 +300,12 @@ class Silence:
 
 
 def lacking_in(watch: Watch) -> str:
-    """Robots missing in the final map, as text."""
+    """Robots missing in the final map."""
     return "" if watch.fused is None or not watch.fused.final else describe_missing(watch.fused)
 
 
 def names_only(ended: Ended, lacks: str) -> bool:
-    """Whether a process failed only because of missing robots."""
+    """Whether it failed only because of missing robots."""
     last = ended.last_lines[-1] if ended.last_lines else ""
     return bool(lacks) and ended.exit == 1 and last.endswith(f"error: {lacks}")
 

@@ -34,12 +34,12 @@ _PROGRESS = ("measurements", "submaps", "messages")
 
 @dataclass
 class Watch:
-    """State of a running team: last status of each node, last map.
+    """State of a running team.
 
-    drivers: awaited drivers of a live team. place: options by which other commands reach the team;
-    call: the same for a driver's program. notes: process events. last_message: time of each node's
-    last status. peers: robots that need a final map; concluded: those that have it, since
-    concluded_s. centre: presents peers' messages as a centre's.
+    drivers: awaited ones of a live team. place: options by which other commands reach the team;
+    call: the same for a driver's program. last_message: time of each node's last status. peers:
+    robots that need a final map; concluded: those that have it, since concluded_s. centre: presents
+    peers' messages as a centre's.
     """
 
     statuses: dict[str, m.Status] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class Watch:
 
     @property
     def world(self) -> m.Status | None:
-        """The world's status; for a live team, the sum of its drivers'."""
+        """The world's status, or the sum of the drivers'."""
         if self.drivers is None:
             return self.statuses.get("world")
         statuses = [s for node, s in self.statuses.items() if node.startswith("source/")]
@@ -103,7 +103,7 @@ class Watch:
 
     @cached_property
     def errors(self) -> "LiveErrors":
-        """Errors so far; loaded with NumPy at the first truth or map, when all processes run."""
+        """Errors so far; NumPy is loaded when all processes run."""
         from teamslam.sim.launch.live_errors import LiveErrors
 
         return LiveErrors()
@@ -115,7 +115,7 @@ class Watch:
 
     @property
     def end_reason(self) -> str:
-        """Why the run ended, as text."""
+        """Why the run ended."""
         if self.is_over:
             return "the final map is there"
         if self.given_up:
@@ -124,7 +124,7 @@ class Watch:
 
     @property
     def is_over(self) -> bool:
-        """Whether the final map exists: the centre's, or that of every peer."""
+        """Whether the centre's final map exists, or that of every peer."""
         if not self.peers:
             return self.fused is not None and self.fused.final
         for name in self.given_up:
@@ -173,7 +173,7 @@ class Watch:
         self.notes.append(f"at {elapsed:.1f} s {text}")
 
     def progress(self, node: str) -> float:
-        """Progress by a node's last status; for the router, the team's."""
+        """Progress by the last status; of the router, the team's."""
         names = list(self.statuses) if node == "router" else [node]
         statuses = [self.statuses[name] for name in names if name in self.statuses]
         figures = [status.figures.get(name, 0.0) for status in statuses for name in _PROGRESS]
@@ -185,7 +185,7 @@ def _robot(status: m.Status) -> str:
 
 
 def team_time(world: m.Status) -> str:
-    """Format team time; Unix time as time of day (UTC)."""
+    """Team time as text; Unix time as UTC."""
     seconds = world.figures.get("team_time_s", 0.0)
     if seconds < UNIX_S:
         return f"team time {seconds:,.0f} s"

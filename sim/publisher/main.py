@@ -30,7 +30,7 @@ def run_world(
     recorder: bool,
     cache: int | None = None,
 ) -> None:
-    """Publish every measurement of the world, then wait for the final map."""
+    """Publish the world, then wait for the final map."""
     robots = [robot.id for robot in scenario.robots]
     announcement = announce_configuration("world", 0, 0, scenario)
     node = WorldNode(
@@ -74,7 +74,7 @@ def run_world(
 
 
 def expected_configurations(scenario: Scenario) -> dict[str, m.Configuration]:
-    """Configurations that centre and robots of a scenario announce, by node."""
+    """Configurations that a scenario's nodes announce."""
     nodes = {ch.robot_node(robot.id): robot for robot in scenario.robots}
     robots = {node: announce_configuration(node, 0, 0, robot) for node, robot in nodes.items()}
     central = announce_configuration("central", 0, 0, scenario.central)

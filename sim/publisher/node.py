@@ -1,7 +1,4 @@
-"""World node: publishes every robot's measurements in team time, as far as credit allows.
-
-As the source of the streams it also answers requests for missed measurements.
-"""
+"""World node: publishes measurements in team time, as far as credit allows."""
 
 import json
 from collections import deque
@@ -33,7 +30,7 @@ REMEDY = "start it again with the same scenario and options"
 
 
 class Configurations:
-    """Expected configurations by node, and received announcements."""
+    """Expected configurations by node, and announcements."""
 
     def __init__(self, expected: Mapping[str, m.Configuration]) -> None:
         self._expected = expected
@@ -66,24 +63,24 @@ class Configurations:
 
     @property
     def mismatches(self) -> tuple[str, ...]:
-        """Deviating nodes, their fields and the remedy, by node."""
+        """Deviating nodes, fields and remedy."""
         return tuple(self._mismatches[node] for node in sorted(self._mismatches))
 
     @property
     def forbid(self) -> bool:
-        """Whether a scenario's node announced only wrong configurations.
+        """Whether a node announced only wrong configurations.
 
-        If both arrived, another process uses the name: a warning, but the world begins.
+        If both arrived, another process uses the name: a warning.
         """
         return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 
     def unheard(self, nodes: Collection[str]) -> list[str]:
-        """Nodes whose expected announcement has not arrived."""
+        """Nodes that have announced nothing."""
         return sorted((self._expected.keys() & set(nodes)) - self._announced)
 
 
 def differences(announced: str, expected: str) -> list[str]:
-    """Differing fields of two JSON configurations, with both values."""
+    """Differing fields of two JSON configurations."""
     theirs, ours = dict(_fields(json.loads(announced))), dict(_fields(json.loads(expected)))
     return [
         f"{name} is {theirs.get(name, 'absent')} there and {ours.get(name, 'absent')} here"
@@ -110,12 +107,11 @@ RESUME_S = 2.0
 class WorldNode:
     """Publish the world: call `begin`, `publish` until `ended`, and `handle` for each message.
 
-    expected: nodes that must be alive first. speed: team seconds per clock second; infinite for
-    credit-limited. cache: last measurements of a robot that can be requested again; None: all. An
-    older request begins a new incarnation instead: unknown initial pose, counters from zero.
-    configurations: expected announcements; a wrong one holds back the world. tells_map: publish
-    true landmarks for localisation-only robots. batch_s: most team time between checks for
-    messages. peers: robots whose own final maps are awaited, until all have the same set.
+    expected: nodes that must be alive first. speed: team seconds per clock second; infinite:
+    limited by credit. cache: last measurements of a robot that can be requested again; an older
+    request begins a new incarnation: unknown initial pose, counters from zero. tells_map: publish
+    true landmarks for localisation. batch_s: most team time between checks for messages. peers:
+    robots whose final maps are awaited, until all have the same set.
     """
 
     streams: WorldStreams
@@ -166,14 +162,14 @@ class WorldNode:
 
     @property
     def waiting_for(self) -> list[str]:
-        """Nodes not yet alive, or without announced configuration."""
+        """Nodes not alive, or without announced configuration."""
         if self._began_at is not None:
             return []
         silent = self.configurations.unheard(self.expected & self._alive)
         return sorted([*(self.expected - self._alive), *silent])
 
     def begin(self) -> list[Outgoing]:
-        """First messages: scenario, true landmarks for the evaluator, and known map."""
+        """First messages: scenario, true landmarks, known map."""
         out = [Outgoing(ch.WORLD_CONFIG, "", self.scenario)]
         if self.streams.landmarks is not None:
             order = np.argsort(self.streams.landmark_ids)
@@ -214,7 +210,7 @@ class WorldNode:
         return None
 
     def handle(self, message: m.Message) -> list[Outgoing]:
-        """Process progress, liveliness, configurations and final map; return nothing to send."""
+        """Process a message; return nothing to send."""
         match message:
             case m.Liveliness():
                 self._take_liveliness(message)
@@ -245,9 +241,8 @@ class WorldNode:
         return []
 
     def _finish(self) -> None:
-        """End once the centre, if expected, and every peer have their final maps.
-
-        Peers do not need the centre, so an absent one is not awaited.
+        """End once an expected centre and every peer have final maps; peers do not need an absent
+        centre.
         """
         conclusions = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
         agreed = (
@@ -258,9 +253,8 @@ class WorldNode:
         self.finished = self.finished or (agreed and central)
 
     def _note_too_far(self, progress: m.Progress, source: Source) -> None:
-        """Treat progress beyond the published measurements as complete.
-
-        Otherwise the world would wait forever for credit of a node that took a stranger's messages.
+        """Treat progress beyond the published measurements as complete: else a node that took a
+        stranger's messages would hold the world for ever.
         """
         if progress.node == "recorder":
             stream = (progress.robot, progress.incarnation)
@@ -286,10 +280,10 @@ class WorldNode:
             self._finish()
 
     def _going_on(self, clock_s: float) -> bool:
-        """Whether an earlier process had begun the world, and all progress is known.
+        """Whether an earlier process began the world, and all progress is known.
 
-        One scenario gives the same streams, so this process continues from the least progress, in
-        the same incarnations. Receivers drop repetitions and request gaps.
+        This process continues from the least progress, in the same incarnations; receivers drop
+        repetitions.
         """
         if not self._consumed:
             return False
@@ -300,7 +294,7 @@ class WorldNode:
         return not waiting or clock_s - self._resumed_at >= RESUME_S
 
     def _skip(self) -> list[Outgoing]:
-        """Skip measurements that everyone has; return the initial poses again for a late centre."""
+        """Skip common measurements; return the initial poses for a late centre."""
         starts = []
         for name, source in self._sources.items():
             incarnation = max(
@@ -337,7 +331,7 @@ class WorldNode:
 
     @property
     def unrecorded(self) -> int:
-        """Number of measurements that a living recorder still lacks."""
+        """Number of measurements that a living recorder lacks."""
         if not self._recorder:
             return 0
         return self._published - self._unrecorded - sum(self._recorded.values())
@@ -393,7 +387,7 @@ class WorldNode:
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _without_credit(self, source: Source) -> str | None:
-        """Node whose progress blocks this robot's next measurement, or None."""
+        """Node that blocks this robot's next measurement."""
         if source.alive and source.published - source.consumed >= CREDIT_MEASUREMENTS:
             return ch.robot_node(source.stream.robot)
         return "recorder" if self.unrecorded >= CREDIT_RECORDER else None
@@ -409,7 +403,7 @@ class WorldNode:
         return m.End(stamp_ns=self.now_ns, streams=ends, notes=tuple(notes))
 
     def measurements(self, request: bytes) -> Iterable[bytes]:
-        """Answer a `MeasurementsRequest` with at most ANSWER published measurements."""
+        """Answer a `MeasurementsRequest`."""
         requested = decoded(request, m.MeasurementsRequest)
         source = self._sources.get(requested.robot)
         if source is None or requested.incarnation not in (0, source.incarnation):
@@ -426,7 +420,6 @@ class WorldNode:
         )
 
     def _begin_incarnation(self, source: Source) -> None:
-        """Restart an interrupted stream at an unknown pose."""
         source.incarnation += 1
         source.base = source.published - 1
         source.consumed = source.base
@@ -457,6 +450,6 @@ class WorldNode:
 
 
 def expected_nodes(robots: Sequence[str], *, recorder: bool, centre: bool = True) -> frozenset[str]:
-    """Nodes that must be alive before the world begins."""
+    """Nodes that must be alive first."""
     nodes = {ch.robot_node(robot) for robot in robots} | ({"central"} if centre else set())
     return frozenset(nodes | {"recorder"} if recorder else nodes)

@@ -34,7 +34,7 @@ class Name(TypedDict):
 
 @dataclass
 class Source:
-    """A robot's stream; its present incarnation began at measurement `base`."""
+    """A robot's stream; its incarnation began at measurement `base`."""
 
     stream: RobotStream
     incarnation: int = FIRST_INCARNATION
@@ -46,16 +46,16 @@ class Source:
 
     @property
     def counter(self) -> int:
-        """Number of measurements published in this incarnation."""
+        """Number of published measurements."""
         return self.published - self.base
 
     def outgoing(self, index: int) -> Outgoing:
-        """Measurement at `index` of the whole stream, with its channel."""
+        """Measurement at `index` of the stream, with its channel."""
         channel = _CHANNEL_OF_KIND[int(self.stream.kinds[index])]
         return Outgoing(channel, self.stream.robot, self.message(index))
 
     def message(self, index: int) -> m.Measurement:
-        """Measurement at `index` of the whole stream, numbered in this incarnation."""
+        """Measurement at `index`, numbered in this incarnation."""
         stream = self.stream
         kind, row, stamp_ns = (int(a[index]) for a in (stream.kinds, stream.rows, stream.stamps_ns))
         name = Name(
@@ -85,7 +85,7 @@ class Source:
         return _start(stream.start, name)
 
     def truth(self, until_ns: int, batch_ns: int = TRUTH_BATCH_NS) -> list[Outgoing]:
-        """Unpublished true poses up to a time, once they span `batch_ns`."""
+        """Unpublished true poses, once they span `batch_ns`."""
         stream = self.stream
         if stream.truth is None or stream.truth_ns is None:
             return []
@@ -156,7 +156,7 @@ def _odometry(intervals: Intervals, row: int, name: Name) -> m.AnyOdometry:
 
 
 def for_the_evaluator(stream: RobotStream) -> list[Outgoing]:
-    """True identities of unidentified detections, and another sensor's (GPS) path."""
+    """True identities, and another sensor's (GPS) path."""
     out, seen, first_ns = [], stream.landmark_detections, int(stream.stamps_ns[0])
     if seen.hidden is not None and seen.hidden.any():
         rows = np.repeat(seen.hidden, np.diff(seen.offsets))

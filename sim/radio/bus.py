@@ -1,7 +1,7 @@
-"""Simulate a robot's radio at its bus: drop messages of robots out of reach on arrival.
+"""Simulate a robot's radio at its bus: drop messages of robots out of reach.
 
-The world announces radio reach in advance (`world/radio`). A message counts as sent at its stamp,
-so a run does not depend on the speed of team time; its bytes and receiver decide random loss.
+The world announces radio reach in advance (`world/radio`). A message counts as sent at its stamp;
+its bytes and receiver decide random loss.
 """
 
 import heapq
@@ -29,9 +29,9 @@ PERIOD_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Reach:
-    """Reach between robots: row t holds for one period from first_ns + t · PERIOD_NS.
+    """Reach between robots: row t holds from first_ns + t · PERIOD_NS.
 
-    pairs: T × P, pairs of robots in order. ends_ns: end of each robot's stream.
+    pairs: T × P, pairs of robots in order. ends_ns: end of each stream.
     """
 
     robots: tuple[str, ...]
@@ -52,7 +52,7 @@ class Reach:
 
 
 def reach_of(radio: Radio, streams: Sequence[RobotStream]) -> Reach:
-    """Reach between the robots of a world; raises ValueError if a range needs missing truth."""
+    """Reach in a world; raises ValueError if a range needs missing truth."""
     robots = tuple(stream.robot for stream in streams)
     first_ns = min((int(s.stamps_ns[0]) for s in streams if len(s)), default=0)
     ends_ns = {s.robot: int(s.stamps_ns[-1]) if len(s) else first_ns for s in streams}
@@ -129,7 +129,7 @@ class RadioBus:
     def ask(
         self, channel: ch.Channel, name: str, request: m.Message, timeout_s: float
     ) -> list[bytes]:
-        """Request from the test bench or the robot's own source, and wait."""
+        """Request from the test bench or the own source."""
         self._tap(self.tap)
         try:
             return self._bus.ask(channel, name, request, timeout_s)
@@ -137,7 +137,7 @@ class RadioBus:
             self._tap(None)
 
     def request(self, channel: ch.Channel, name: str, request: m.Message) -> None:
-        """Send a request; dropped if the robot is out of reach."""
+        """Send a request to a robot in reach."""
         robot = ch.robot_of(name)
         if channel is not ch.MEMBERS or robot is None or self._reaches(robot, self._now_ns):
             self._bus.request(channel, name, request)
@@ -155,7 +155,7 @@ class RadioBus:
         self._bus.answer(channel, name, answer_in_reach)
 
     def receive(self, timeout_s: float) -> list[Sample]:
-        """Delivered messages, and tokens of robots that came into or left reach."""
+        """Messages, and tokens of robots whose reach changed."""
         through: list[Sample] = []
         for sample in self._bus.receive(timeout_s):
             found = ch.channel_of(sample.key)
@@ -217,9 +217,7 @@ class RadioBus:
         self._tokens[robot] = decoded(sample.payload, m.Liveliness).alive
 
     def _changes(self) -> list[Sample]:
-        """Liveliness tokens of robots that came into or left reach: alive means living and in
-        reach.
-        """
+        """Tokens of robots that came into or left reach: alive means in reach, too."""
         changed = []
         for robot, alive in self._tokens.items():
             in_reach = alive and self._reaches(robot, self._now_ns)
@@ -237,7 +235,7 @@ def behind_radio(bus: Bus, robot: str, radio: Radio) -> Bus:
 
 
 def plan_of(reach: Reach) -> m.RadioPlan:
-    """Encode the world's announcement of radio reach."""
+    """Encode the announced reach."""
     return m.RadioPlan(
         stamp_ns=reach.first_ns,
         robots=reach.robots,
@@ -247,7 +245,7 @@ def plan_of(reach: Reach) -> m.RadioPlan:
 
 
 def reach_in(payload: bytes) -> Reach | None:
-    """Decode the world's announcement of radio reach."""
+    """Decode the announced reach."""
     try:
         plan = decoded(payload, m.RadioPlan)
     except WireError:

@@ -1,4 +1,4 @@
-"""Convert a log's raw measurements to chains of poses, the input of the batch optimiser."""
+"""Chains of poses from a log's raw measurements, for the batch optimiser."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class BatchReferenceError(RuntimeError):
 
 
 class Scan(NamedTuple):
-    """Accepted, calibrated ranges [m] and bearings [rad] from one pose; own: their covariances."""
+    """Accepted, calibrated ranges [m] and bearings [rad]; own: covariances."""
 
     ids: UInt32[np.ndarray, " n"]
     ranges: Float[np.ndarray, " n"]
@@ -49,9 +49,7 @@ class Scan(NamedTuple):
     own: Own = unclaimed(0)
 
     def noise(self, k: int, sensor: Sensor, distance: float) -> Matrix:
-        """Covariance of (range, bearing) k at this predicted range; of a point, at the measured
-        one.
-        """
+        """Covariance of (range, bearing) k at this predicted range; a point's own."""
         if not self.own.size:
             return np.diag(noise(sensor, distance))
         rr, rb, bb = self.own[k, :3]
@@ -60,12 +58,11 @@ class Scan(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """One incarnation of a robot's stream: N + 1 poses of its sensor, the first at the initial
-    pose.
+    """One incarnation: N + 1 poses of the sensor, the first at the initial pose.
 
     The base is at pose ∘ mount⁻¹. increments[i] leads from pose i to pose i + 1, scans[i] is from
-    pose i + 1. start: initial pose (None: unknown), with its covariance (None: exact). sightings:
-    inter-robot measurements from the base's poses at grid times, if requested.
+    pose i + 1. start: None: unknown; start_covariance: None: exact. sightings: from the base's
+    poses at grid times.
     """
 
     config: RobotConfig
@@ -93,7 +90,7 @@ class Chain:
 
     @property
     def dead_reckoned(self) -> Float[np.ndarray, "K 3"]:
-        """Poses by odometry alone, in the first one's frame."""
+        """Poses by odometry, in the first one's frame."""
         poses = [np.zeros(3)]
         for increment in self.increments:
             poses.append(compose(poses[-1], increment.mean))
@@ -103,10 +100,9 @@ class Chain:
 def chains_of(
     samples: Iterable[Sample], scenario: TeamConfig, *, sightings: bool = False
 ) -> list[Chain]:
-    """Chains of all robots by (robot, incarnation), each measurement once and in order.
+    """Chains by (robot, incarnation), each measurement once and in order.
 
-    sightings: with a pose at each grid time (`front_end.node_s`). Raises WireError for an invalid
-    measurement.
+    sightings: with a pose at each grid time (`front_end.node_s`). Raises WireError.
     """
     streams: dict[tuple[str, int], dict[int, m.Measurement]] = {}
     for sample in samples:
@@ -192,7 +188,7 @@ def _grid(config: RobotConfig) -> PoseGrid | None:
 def place_chains(
     chains: Sequence[Chain], run: Evaluation
 ) -> tuple[list[Chain], list[Path], tuple[str, ...]]:
-    """Chains with a known place in the team's frame, and the joined poses that determine it."""
+    """Chains with a place in the team's frame, the joined poses of each, and the others."""
     known, anchors, left_out = [], [], []
     for chain in chains:
         robot = chain.config.id
@@ -211,10 +207,10 @@ def place_chains(
 
 
 def anchor_chain(chain: Chain, anchors: Path) -> list[Float[np.ndarray, "K 3"]]:
-    """Interpolate a chain's poses between known poses (at least one) by its odometry.
+    """Interpolate poses between known ones by odometry: forward, backward, and the mean of both,
+    weighted by the time to each.
 
-    Three ways: forward from the known pose before; backward from the one after; the mean of both,
-    weighted by the time to each. Odometry up to a known pose counts to the last pose not after it.
+    Odometry up to a known pose counts to the last pose not after it.
     """
     odometry = chain.dead_reckoned
     at = np.searchsorted(chain.stamps_ns, anchors.stamps_ns, side="right") - 1

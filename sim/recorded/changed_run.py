@@ -30,12 +30,11 @@ Span = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """Changes of a run on the log's measurements.
+    """Changes of a run.
 
     without: robots left out. seed: of estimators and losses. loss, delay_s: of submaps to the
-    centre. partitions: robots that the centre cannot reach, and when. noise: factors on assumed
-    standard deviations, by kind. maps: saved maps, by path. localise: robots are localised in the
-    map, which stays as it is.
+    centre. partitions: robots that the centre cannot reach, and when. noise: factors on standard
+    deviations, by kind. localise: robots are localised in the map.
     """
 
     without: tuple[str, ...] = ()
@@ -54,10 +53,8 @@ class Changes:
 
 
 def changed_run(log: Samples, changes: Changes) -> list[Sample]:
-    """Samples of the changed run, as of a recorder.
-
-    Raises ScenarioError for a meaningless change, SavedMapError, RerunError for missing
-    measurements.
+    """Samples of the changed run, as of a recorder; raises ScenarioError, SavedMapError,
+    RerunError.
     """
     world = RecordedWorld(log, changes.without)
     scenario = changed_scenario(world.scenario, changes)
@@ -127,7 +124,7 @@ KINDS: Mapping[str, str] = MappingProxyType(
 
 
 def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
-    """Scale the robot's standard deviations by the factor of their kind (see KINDS)."""
+    """Scale standard deviations by the factor of their kind."""
     motion = _motion(robot.motion, factors.get("odometry", 1.0))
     by_range = factors.get("range", 1.0)
     sensor: Sensor = msgspec.structs.replace(
@@ -140,7 +137,7 @@ def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
 
 
 def _motion(motion: MotionModel, factor: float) -> MotionModel:
-    """Scale the motion noise: the α are variances, all else is a standard deviation."""
+    """Scale noise: the α are variances, all else a standard deviation."""
 
     def scaled(noise: MotionNoise) -> MotionNoise:
         return MotionNoise(noise.per_s * factor, noise.per_m * factor, noise.per_rad * factor)

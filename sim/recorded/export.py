@@ -1,8 +1,7 @@
 """Export a log's measurements: a landmark graph (g2o, isam, pyfg) or a UTIAS data set.
 
-Poses of a graph are the sensor's at keyframes, from the final map and the odometry between; without
-a map, by odometry alone. Edges are the odometry, and each accepted measurement as a point with the
-first-order covariance of range and bearing.
+Poses of a graph are the sensor's at keyframes, from the final map and odometry, or odometry alone.
+Edges are the odometry, and accepted measurements as points with first-order covariance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -48,10 +47,7 @@ FORMATS = ("g2o", "isam", "pyfg")
 
 
 def export_graph(log: Log, folder: Path, form: str) -> list[Path]:
-    """Write graph.g2o, graph.pyfg, or isam's ROBOT.txt of each robot; return the files.
-
-    Raises `LogError` for a log without the measurements.
-    """
+    """Write graph.g2o, graph.pyfg, or isam's ROBOT.txt of each robot; raises LogError."""
     run = evaluate(log.samples())
     graph = _graph(log, run)
     if form == "isam":
@@ -153,11 +149,7 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 
 
 def export_utias(log: Log, folder: Path) -> list[str]:
-    """Write the data set into `folder`, robots in the order of their numbers 1, 2, …
-
-    The format has one stream per robot: the first incarnation. Raises LogError for missing
-    measurements.
-    """
+    """Write the first incarnations, robots in the order of their numbers; raises LogError."""
     messages = list(_sound(log))
     measurements = [each for each in messages if isinstance(each, m.Measurement)]
     robots = {each.robot for each in measurements if each.incarnation == FIRST_INCARNATION}
@@ -199,7 +191,7 @@ LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"
 
 
 def g2o_lines(graph: FactorGraph) -> Iterator[str]:
-    """Lines of a g2o file: poses are numbered behind the landmarks."""
+    """Lines of a g2o file: poses are numbered behind landmarks."""
     first = max(graph.landmarks, default=-1) + 1
     vertex: dict[Key, int] = {}
     for landmark, point in sorted(graph.landmarks.items()):
@@ -226,7 +218,7 @@ def g2o_lines(graph: FactorGraph) -> Iterator[str]:
 
 
 def isam_lines(graph: FactorGraph, robot: str) -> Iterator[str]:
-    """Lines of an isam file of one robot, with the root S of the information SᵀS."""
+    """Lines of one robot, with the root S of the information SᵀS."""
     number = {key: k for k, key in enumerate(graph.chain(robot)[0])}
     seen_from: dict[Key, list[str]] = {}
     for seen in graph.point_edges:

@@ -33,9 +33,8 @@ PART = "`teamslam log cut LOG --from S --to S -o PART.mcap` makes a log of a par
 
 
 def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
-    """Read the measurements of a log with its scenario: its world's, or the recorder's.
-
-    Uses the first incarnation of each robot. Raises LogError, ScenarioError.
+    """Measurements of a log's first incarnations, with its scenario; raises LogError,
+    ScenarioError.
     """
     log = open_log(path)
     messages = [opened(sample)[2] for sample in log.samples(CHANNELS)]
@@ -55,9 +54,9 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
 def recorded_streams(
     messages: Sequence[m.Message], source: str, clocks: Mapping[str, float] | None = None
 ) -> WorldStreams:
-    """Streams of the measurements among these messages.
+    """Streams of these messages.
 
-    clocks: corrected offset of each robot's odometry clock [s]; absent: none.
+    clocks: corrected offset of each odometry clock [s].
     """
     offsets = {} if clocks is None else clocks
     measurements: dict[str, dict[int, m.Measurement]] = {}
@@ -171,7 +170,7 @@ FORM_NAMES = {
 
 
 def forms_of(messages: Sequence[m.Measurement]) -> str:
-    """Describe the forms of these messages with their counts if there are several; else ""."""
+    """Describe the forms with their counts if there are several."""
     kinds = [type(each) for each in messages]
     counts = {kind: kinds.count(kind) for kind in FORM_NAMES if kind in kinds}
     if len(counts) < 2:
@@ -216,7 +215,7 @@ def intervals_of(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: 
 def landmarks_of(
     messages: Sequence[m.AnyScan | m.Detections], labels: m.TruthLabels | None
 ) -> Detections:
-    """Scans, message by message, with and without identities; labels: for those without."""
+    """Scans with and without identities; labels: for the latter."""
     named = [each for each in messages if not isinstance(each, m.Detections)]
     unnamed = [each for each in messages if isinstance(each, m.Detections) and each.ranges]
     seen = _scans(named, [translate.scan_of(each) for each in named])

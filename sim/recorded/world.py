@@ -1,4 +1,4 @@
-"""A world from a log: its measurements and its truth, second by second of team time."""
+"""A world from a log."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
@@ -48,9 +48,9 @@ def _without(measurement: m.Measurement, robots: Collection[str]) -> m.Measureme
 
 
 class RecordedWorld:
-    """Messages of a log's world, for some of its robots, in the order of team time.
+    """Messages of a log's world, for some robots, by team time.
 
-    Raises RerunError for a missing measurement, after which no robot could continue.
+    Raises RerunError for a missing measurement.
     """
 
     listens: ClassVar[tuple[ch.Channel, ...]] = ()
@@ -102,13 +102,13 @@ class RecordedWorld:
 
     @property
     def scenario(self) -> Scenario:
-        """Scenario of the recorded run; raises RerunError, ScenarioError."""
+        """Recorded scenario; raises RerunError, ScenarioError."""
         if self._configured is None:
             raise RerunError("the log has no scenario: its world was not recorded")
         return loads(self._configured.configuration)
 
     def announce(self, scenario: Scenario) -> None:
-        """Set the scenario for `begin`; raises RerunError if its known map is not in the log."""
+        """Set the scenario for `begin`; raises RerunError for a missing known map."""
         if scenario.estimator in NEEDS_MAP:
             truth = [o.message for o in self._outgoing if isinstance(o.message, m.TruthLandmarks)]
             if not truth:
@@ -129,7 +129,7 @@ class RecordedWorld:
         return self._outgoing
 
     def publish(self, clock_s: float) -> list[Outgoing]:
-        """Publish the next STEP_NS of team time; the last of them with the end."""
+        """Publish the next STEP_NS of team time, and the end."""
         if self._ended:
             return []
         until_ns = self.now_ns + STEP_NS
@@ -168,10 +168,7 @@ def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...
 
 
 class DataSetRun:
-    """All messages of a team on a data set, with the data set's own scenario.
-
-    Raises DatasetError, ScenarioError.
-    """
+    """All messages of a team on a data set; raises DatasetError, ScenarioError."""
 
     def __init__(self, path: Path) -> None:
         streams, scenario, _ = open_data_set(path)
@@ -187,7 +184,7 @@ class DataSetRun:
 
 
 def log_or_run(path: Path) -> Samples:
-    """A log, or the run on a data set; raises LogError, DatasetError, ScenarioError."""
+    """A log, or the run on a data set."""
     if path.suffix == ".mcap" or (path.is_file() and path.suffix != ".zip"):
         return open_log(path)
     return DataSetRun(path)

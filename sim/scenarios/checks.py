@@ -27,7 +27,7 @@ class ScenarioError(ValueError):
 
 
 def check_fields(value: object, declared: Any, at: str) -> None:
-    """Raise ScenarioError for unknown fields, wrong choices and non-finite numbers.
+    """Refuse unknown fields, wrong choices and non-finite numbers.
 
     declared: type of `value`; `at`: its path in the file. msgspec checks types and bounds.
     """
@@ -65,12 +65,12 @@ def _check_radians(sigma: object, at: str) -> None:
 
 @cache
 def types_of(declared: type) -> dict[str, Any]:
-    """Evaluated field types of a struct, cached because evaluation outlasts a check."""
+    """Field types of a struct, cached since evaluation is slow."""
     return {field.name: field.type for field in msgspec.structs.fields(declared)}
 
 
 def check_known(name: str, known: list[str], at: str) -> None:
-    """Raise ScenarioError if `name` is not known at this place."""
+    """Refuse an unknown name."""
     if name in known:
         return
     where = f"at {at}" if at else "at the top"

@@ -53,7 +53,7 @@ def builtin_text(name: str) -> str:
 
 
 def named_document(name: str) -> tuple[Fields, str]:
-    """Document of a built-in scenario or user file, merged over its base; and its short name.
+    """Merged document of a built-in scenario or user file, and its short name.
 
     A data set's `scenario.toml` is named after its folder or zip.
     """
@@ -67,7 +67,7 @@ def named_document(name: str) -> tuple[Fields, str]:
 
 
 def named_after(data_set: Path) -> str:
-    """Name of a data set's team: that of its folder or file."""
+    """Name of a data set's team."""
     return _short_name(data_set_name(data_set.resolve()))
 
 
@@ -76,10 +76,10 @@ def _short_name(text: str) -> str:
 
 
 def own_document(name: str) -> Fields:
-    """Document of a user's file, unmerged.
+    """Unmerged document of a user's file.
 
-    The data set's path is converted from file-relative to working-directory-relative; a file in a
-    zip describes that zip.
+    The data set's path becomes relative to the working directory; a file in a zip describes that
+    zip.
     """
     archive, path = _file_at(Path(name))
     if path.is_dir():
@@ -116,7 +116,7 @@ def _file_at(path: Path) -> "tuple[Path | None, Path | zipfile.Path]":
 def resolve(document: Fields, stem: str, known: Sequence[str]) -> Fields:
     """Merge defaults into every robot and add names; `known`: fields of a scenario.
 
-    Values are checked where the user wrote them, so errors name that place.
+    Values are checked where the user wrote them.
     """
     for name in document:
         check_known(name, [*known, "base", "defaults", "robot_count"], "")
@@ -157,14 +157,14 @@ def _unnamed(world: Fields, count: object) -> list[Fields]:
 
 
 def checked_table(value: object, at: str) -> Fields:
-    """Return the value if it is a table; raises ScenarioError."""
+    """Return a table; raises ScenarioError."""
     if not isinstance(value, dict):
         raise ScenarioError(f"expected a table, got {type(value).__name__} at {at}")
     return value
 
 
 def checked_count(count: object) -> int:
-    """Return the value if it is a team size; raises ScenarioError."""
+    """Return a team size; raises ScenarioError."""
     if not isinstance(count, int) or isinstance(count, bool):
         raise ScenarioError(f"expected a number of robots from 1 to {MAX_ROBOTS}, got {count!r}")
     if not 1 <= count <= MAX_ROBOTS:

@@ -58,7 +58,7 @@ class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True
     radio: Radio = Radio()
 
     def config_of(self, robot: str) -> RobotConfig | None:
-        """Configuration of a robot; for an unnamed one, that of newcomers."""
+        """Configuration of a robot, or of newcomers."""
         named = next((config for config in self.robots if config.id == robot), None)
         if named is not None or not isinstance(self.world, LiveWorld) or not self.world.admit:
             return named
@@ -79,7 +79,7 @@ class Scenario(TeamConfig, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 def load(name_or_path: str | Path) -> Scenario:
-    """Load a built-in scenario by name, or a user's TOML file; raises ScenarioError."""
+    """Load a built-in scenario, or a TOML file; raises ScenarioError."""
     name = str(name_or_path)
     known = list(types_of(Scenario))
     try:
@@ -102,10 +102,10 @@ def with_options(
     identities: str | None = None,
     localise: bool = False,
 ) -> Scenario:
-    """Apply command-line changes; None leaves a field unchanged. Raises ScenarioError.
+    """Apply command-line changes; None leaves a field; raises ScenarioError.
 
-    peers, centre: whether they exist. robots: number; further ones repeat the scenario's in turn,
-    with new ids, or those of the data set's folder, which limits their number.
+    robots: number; further ones repeat the scenario's in turn, with new ids, or those of the data
+    set's folder.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
@@ -144,7 +144,7 @@ def with_options(
 
 
 def _profile_of(scenario: Scenario, share: float = 1.0) -> AssociationProfile:
-    """Association thresholds, in lengths of the robots' coarsest sensor at a share of its range."""
+    """Association thresholds by the coarsest sensor at a share of its range."""
     world = scenario.world
     seen_m = world.visible_to_m if isinstance(world, SimulatedWorld) else None
     far_m = FAR_M if seen_m is None else seen_m
@@ -173,7 +173,7 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
 
 
 def _kind_of(path: str, otherwise: str) -> str:
-    """Kind of a data set; `otherwise` if undetermined, so that reading it reports the fault."""
+    """Kind of a data set; `otherwise` if undetermined: reading it reports the fault."""
     from teamslam.sim.datasets.kinds import kind_of
     from teamslam.sim.datasets.tables import DatasetError
 
@@ -186,7 +186,7 @@ def _kind_of(path: str, otherwise: str) -> str:
 def _of_folder(
     robots: Sequence[Fields], path: str, count: int | None
 ) -> tuple[list[Fields], tuple[str, ...]]:
-    """Robots that the folder has, and all names in it; raises ScenarioError if it has fewer."""
+    """Robots of a folder, and all names in it."""
     from teamslam.sim.datasets.folder_files import robots_of
 
     names = robots_of(path)
@@ -197,7 +197,7 @@ def _of_folder(
 
 
 def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
-    """Robots that the data set has; without any, its own robots by their pattern."""
+    """Robots that the data set has, else its own by the scenario's."""
     chosen = [robot for robot in robots if robot["id"] in names]
     return chosen or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
 
@@ -208,7 +208,7 @@ def dumps(scenario: Scenario) -> str:
 
 
 def loads(text: str) -> Scenario:
-    """Resolved scenario from JSON, also with former names; raises ScenarioError."""
+    """Scenario from JSON, also with former names; raises ScenarioError."""
     try:
         fields = msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.DecodeError as error:
@@ -228,7 +228,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
 
 
 def _fit_count(robots: Sequence[Fields], count: int, names: Sequence[str]) -> list[Fields]:
-    """The first robots; further ones have names of the data set, else r1, r2, …"""
+    """The first robots, and further ones by names of the data set, else r1, r2, …"""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
     numbered = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1))
@@ -343,7 +343,7 @@ WORLDS: dict[str, type[World]] = {
 
 
 def check_world(world: Fields) -> None:
-    """Check a world's kind and field names; raises ScenarioError."""
+    """Check a world's kind and field names."""
     kind = world.get("kind")
     if not isinstance(kind, str) or kind not in WORLDS:
         raise ScenarioError(_which(kind))

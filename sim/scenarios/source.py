@@ -72,7 +72,7 @@ def scenario_beside(path: str | Path) -> str:
 
 
 def open_data_set(path: str | Path) -> tuple[WorldStreams, Scenario, str | None]:
-    """Streams of all robots of a data set, its scenario, and a note on robots without files.
+    """Streams of a data set, its scenario, and a note on robots without files.
 
     Raises DatasetError, ScenarioError.
     """
@@ -85,9 +85,9 @@ def open_data_set(path: str | Path) -> tuple[WorldStreams, Scenario, str | None]
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
-    """Remove robots without files in the data set; also return a note on them.
+    """Remove robots without files; also return a note on them.
 
-    If none has files all stay, so that reading the data set reports the fault. Raises DatasetError.
+    If none has files all stay: reading the data set reports the fault.
     """
     world = scenario.world
     if not isinstance(world, FolderWorld | UtiasWorld) or not world.path:
@@ -109,7 +109,7 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
 
 
 def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
-    """Whether the robots receive the landmarks. Raises ScenarioError if unknown."""
+    """Whether robots receive the landmarks; raises ScenarioError if unknown."""
     needed = scenario.estimator in NEEDS_MAP
     if needed and streams.landmarks is None:
         raise ScenarioError(
@@ -120,6 +120,6 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
 
 
 def noise_seed(scenario: Scenario) -> int:
-    """Key of the world's random numbers, from scenario name and seed: a positive 63-bit integer."""
+    """Key of random numbers, from scenario name and seed: a positive 63-bit integer."""
     text = f"{scenario.name}/{scenario.seed}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

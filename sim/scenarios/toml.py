@@ -1,4 +1,4 @@
-"""A resolved scenario as TOML that runs its team on the written data set."""
+"""Scenario files beside written data sets."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,16 +14,13 @@ from teamslam.team.config import RobotConfig
 
 
 def data_set_scenario(scenario: Scenario) -> str:
-    """Same robots and centre for the UTIAS data set in this text's folder.
-
-    Robots are named r1, r2, …; default fields are omitted.
-    """
+    """Same robots and centre, for the UTIAS set in this text's folder; robots are r1, r2, …"""
     ids = [f"r{i}" for i in range(1, len(scenario.robots) + 1)]
     return _text(scenario, ids, {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ()))
 
 
 def folder_scenario(scenario: Scenario) -> str:
-    """Same robots and centre for the folder of CSV tables with this text."""
+    """Same robots and centre, for the tables in this text's folder."""
     ids = [robot.id for robot in scenario.robots]
     unknown = [robot for robot in ids if starts_unknown(scenario.world, robot)]
     world: dict[str, Any] = {"kind": "folder", "path": "."}
@@ -44,7 +41,7 @@ def _text(scenario: Scenario, ids: Sequence[str], world: Mapping[str, Any]) -> s
 def _chosen(
     value: msgspec.Struct, declared: type[msgspec.Struct], without: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Non-default fields, including inner tables."""
+    """Non-default fields."""
     chosen: dict[str, Any] = {}
     for field in msgspec.structs.fields(declared):
         part = getattr(value, field.name)

@@ -23,8 +23,8 @@ class SimulatedWorld(
 ):
     """Square of side size_m with point landmarks; robots drive in steps of step_s seconds.
 
-    visible_from_m and visible_to_m limit the *true* range, since a gate on noisy measurements
-    selects by noise and biases the map.
+    visible_from_m and visible_to_m limit the *true* range: a gate on noisy measurements selects by
+    noise and biases the map.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -110,9 +110,9 @@ class FolderWorld(
 class LiveWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="live"
 ):
-    """No world: each robot's driver publishes its measurements and ends its stream.
+    """No world: drivers publish measurements and end streams.
 
-    newcomer: configuration of unnamed robots, the scenario's [defaults].
+    newcomer: configuration of unnamed robots.
     """
 
     admit: bool = False
@@ -122,7 +122,7 @@ class LiveWorld(
 class UnlabelledWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="unlabelled"
 ):
-    """Data set of one robot with unnamed landmarks: odometry.csv and detections.csv.
+    """Data set of one robot with unnamed landmarks.
 
     Several robots each drive a piece of the log from an unknown initial pose.
     """
@@ -137,9 +137,9 @@ class UnlabelledWorld(
 class GraphWorld(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="graph"
 ):
-    """Landmark graph in a text file of isam, TORO, g2o or PyFactorGraph.
+    """Landmark graph of isam, TORO, g2o or PyFactorGraph.
 
-    More robots than the file's one each drive a piece of it; only the first has an initial pose.
+    More robots than the file's one each drive a piece; only the first has an initial pose.
     """
 
     path: str = ""
@@ -152,7 +152,7 @@ World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld 
 
 
 def starts_unknown(world: World, robot: str) -> bool:
-    """Whether the team lacks this robot's initial pose; a live robot's comes from its driver."""
+    """Whether the team lacks this robot's initial pose; a driver gives a live robot's."""
     if isinstance(world, LiveWorld):
         return False
     named = world.unknown_starts
@@ -170,7 +170,7 @@ class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Radio(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Radio of robots without a centre; by default instant and lossless.
 
-    Robots whose streams have ended reach each other, as if they were collected.
+    Robots whose streams have ended reach each other.
     """
 
     comm_range_m: Positive | None = None

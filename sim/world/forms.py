@@ -1,4 +1,4 @@
-"""Odometry and further measurement forms of a simulated robot, without the filter's formulas."""
+"""Odometry and further forms of simulated measurements, without the filter's formulas."""
 
 import numpy as np
 
@@ -26,11 +26,11 @@ def measured_speeds(
     normals: Float[np.ndarray, "K 2"],
     wheel_normals: Float[np.ndarray, "K 2"],
 ) -> tuple[Column, Column]:
-    """Measured forward speed [m/s] and yaw rate [rad/s] of the true steps.
+    """Measured forward speed [m/s] and yaw rate [rad/s].
 
     Forward and turn noise are added to translation d and rotation φ; wheel noise to each wheel's
-    path, from which d and φ are recomputed. The noisy d and φ give ω and v by φ = ω t + veer·d and
-    |d| = (|v| − turn_drag·|ω|)·t; they are divided by the scales.
+    path. The noisy d and φ give ω and v by φ = ω t + veer·d and |d| = (|v| − turn_drag·|ω|)·t; they
+    are divided by the scales.
     """
     of_way, of_turn, _ = _interval_deviations(motion, steps, seconds)
     forward = core.hypot(deviation(motion.forward, seconds, steps), of_way)
@@ -53,7 +53,7 @@ def measured_speeds(
 def slip(
     motion: MotionModel, step: tuple[float, float], seconds: float, normals: Float[np.ndarray, "2"]
 ) -> tuple[float, float]:
-    """Final rotation [rad] and left slip [m] of a step, which odometry does not measure."""
+    """Final rotation [rad] and left slip [m], which odometry does not measure."""
     steps, duration = np.array([step]), np.array([seconds])
     _, _, of_turn = _interval_deviations(motion, steps, duration)
     turn = core.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
@@ -142,12 +142,12 @@ def measured_increments(
     normals: Rows,
     correlation: float,
 ) -> tuple[Rows, Float[np.ndarray, "K 3 3"]]:
-    """Measure the motion between consecutive true poses, with the covariance of its error.
+    """Measure motions between true poses, with error covariances:
 
         true motion = measured motion ∘ Exp(f, l, φ)
 
-    with a constant twist in the frame of the measured end. f, l and φ have the standard deviations
-    of the model's forward, lateral and turn; l and φ have the given correlation.
+    with a constant twist in the frame of the measured end; f, l and φ have the deviations of the
+    model's forward, lateral and turn; l and φ are correlated.
     """
     before, after = poses[:-1], poses[1:]
     true_turn = after[:, 2] - before[:, 2]
@@ -172,7 +172,7 @@ def measured_increments(
 def measured_steering(
     motion: MotionModel, forward: Column, yaw_rate: Column
 ) -> tuple[Column, Column]:
-    """Encoder values of a car at these speeds: (wheel speed [m/s], steering angle [rad]).
+    """Wheel speed [m/s] and steering angle [rad] of a car.
 
     The base turns about a point forward/yaw_rate to its left, on the line of the rear axle.
     """
@@ -191,7 +191,7 @@ def draw_covariances(
     *,
     points: bool,
 ) -> Float[np.ndarray, "V 3"]:
-    """Draw measurement covariances, each of its own size and direction.
+    """Draw covariances of individual size and direction.
 
     Standard deviations are the sensor's times factors between `sizes`: of range and bearing with
     random correlation; of points, range_sigma along two random orthogonal axes.
@@ -213,7 +213,7 @@ def with_errors(
     covariances: Float[np.ndarray, "V 3"],
     normals: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, "V 2"]:
-    """Add errors of these covariances to pairs of numbers."""
+    """Add errors of these covariances."""
     xx, xy, yy = covariances.T
     first = np.sqrt(xx)
     across = xy / first

@@ -20,11 +20,9 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class Hiding:
-    """Parameters of hidden identities.
-
-    tagged: share of landmarks that keep identities. missed: probability that a detection is
+    """tagged: share of landmarks that keep identities. missed: probability that a detection is
     omitted. clutter: share of false detections, uniform in the disc of radius reach_m, or of the
-    robot's farthest detection.
+    farthest detection.
     """
 
     tagged: float = 0.0
@@ -34,7 +32,7 @@ class Hiding:
 
 
 def with_hidden_identities(streams: WorldStreams, hiding: Hiding, seed: int) -> WorldStreams:
-    """Replace observations by detections; random numbers are keyed by seed, robot and purpose."""
+    """Replace observations by detections."""
     rng = np.random.default_rng([seed, 0x7A65])
     ids = np.unique(np.concatenate([s.landmark_detections.ids for s in streams.streams]))
     ids = ids[ids != NO_LABEL]
@@ -109,7 +107,7 @@ def _add_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> 
 
 
 def in_order(parts: Sequence[Detections]) -> Detections:
-    """Merge messages by time; at equal times those with identities first.
+    """Merge messages by time, those with identities first.
 
     Columns of only some parts are NaN elsewhere.
     """

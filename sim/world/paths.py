@@ -1,6 +1,6 @@
-"""True motion of the robots of a simulated world.
+"""True motion of simulated robots.
 
-A step is a pair (distance [m], rotation [rad]); poses (x, y, θ) are in the world frame.
+A step is (distance [m], rotation [rad]); poses (x, y, θ) are in the world frame.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,10 +31,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class Limits:
-    """Motion limits of a step, and the distance at which a way-point is reached.
+    """Limits of a step, and the distance at which a way-point is reached.
 
-    turn_first: a rotating step has no translation. radius: smallest turning radius [m] of a car; 0
-    turns on the spot.
+    turn_first: a rotating step has no translation. radius: smallest turning radius [m]; 0 turns on
+    the spot.
     """
 
     distance: float
@@ -51,9 +51,9 @@ def wrapped(angle: float) -> float:
 
 
 def follow_way_points(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
-    """Follow the polyline through the way-points in steps of equal arc length: rotate, then drive.
+    """Follow a polyline in steps of equal arc length: rotate, then drive.
 
-    A step across a corner is its chord. The first pose points along the first step.
+    A step across a corner is its chord.
     """
     legs = hypot(*np.diff(way_points, axis=0).T)
     arc = np.concatenate(([0.0], np.cumsum(legs)))
@@ -79,8 +79,8 @@ def steer_to_way_points(
 ) -> Drive:
     """Steer to each way-point in turn; stand after the last.
 
-    A step rotates towards the way-point up to the limit, and drives less, the further the way-point
-    lies to the side. slip(k, step): unmeasured final rotation [rad] and left slip [m] of step k.
+    A step rotates towards the way-point up to the limit, and drives less, the further it lies to
+    the side. slip(k, step): final rotation [rad] and left slip [m].
     """
     poses, taken = [start], []
     target = next(way_points, None)
@@ -99,8 +99,8 @@ def move_pose(
 ) -> Pose:
     """Pose after a step, a left slip and a final rotation.
 
-    turn-then-drive: full rotation, then straight. Others: the circular arc, whose chord has length
-    distance · sin(φ/2)/(φ/2) and direction θ + φ/2.
+    turn-then-drive: rotation, then straight. Others: the arc, whose chord has length distance ·
+    sin(φ/2)/(φ/2) and direction θ + φ/2.
     """
     x, y, heading = pose
     distance, turn = step

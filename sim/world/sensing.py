@@ -53,9 +53,9 @@ def persistent_errors(
 ) -> Float[np.ndarray, "V 2"]:
     """Errors of unit variance, partly correlated over time for each point.
 
-    n = √white w + √(1 − white) g with white w and, for each point, g of a first-order Gauss-Markov
-    process: g(t + τ) = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: two columns of
-    w and two of n', range first.
+    n = √white w + √(1 − white) g with white w and g of a first-order Gauss-Markov process: g(t + τ)
+    = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: two columns of w and two of n',
+    range first.
     """
     constant = normals[:, 2:].copy()
     times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
@@ -83,7 +83,7 @@ def measurements(
 
     range = range_scale · (r + σ(r) n₁) + range_offset with σ(r)² = range_sigma² +
     (range_sigma_per_m r)²; bearing = raw + bearing_sigma n₂ with raw = b + bearing_offset +
-    lens(raw). With range_is_depth r + σ(r) n₁ is projected on the optical axis first.
+    lens(raw). With range_is_depth r + σ(r) n₁ is projected on the optical axis.
     """
     raw = seen.bearings + sensor.bearing_offset
     lens = sensor.bearing_lens
@@ -117,10 +117,9 @@ def add_outliers(
 ) -> Detections:
     """Replace a share of the measurements by outliers, from uniform numbers in [0, 1).
 
-    The first number of a row selects outliers. "measurement": the others are the range, uniform in
-    `span` [m], and the bearing, uniform in the field of view. "identity": the second selects
-    another of the landmarks 1 … `landmarks`. "drop": the measurement is omitted. All kinds use the
-    same draws.
+    The first number of a row selects. "measurement": the others are a range in `span` [m] and a
+    bearing in the field of view. "identity": the second selects another landmark 1 … `landmarks`.
+    "drop": omitted.
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":

@@ -56,7 +56,7 @@ LEAST_RADIUS = 1.5
 
 
 def simulate(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
-    """Streams of a team in a simulated world, from stamp 0; landmarks are numbered from 1.
+    """Streams of a team from stamp 0; landmarks are numbered from 1.
 
     Robot i follows path i; without a path, or with slip or arc motion, it steers to way-points.
     Each step ends with one, possibly empty, landmark message, and one of teammates if any is seen.
@@ -97,7 +97,7 @@ def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
 
 
 def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-    """Map uniform numbers to points of the square, or of the disc by radius and direction."""
+    """Points of the square, or of the disc by radius and direction."""
     if world.radius_m is None:
         return uniform * world.size_m
     radius, direction = world.radius_m * uniform[:, 0], 2.0 * np.pi * uniform[:, 1]
@@ -163,7 +163,7 @@ def _random_way_points(
 
 
 def _until_all_stand(world: SimulatedWorld, drives: Sequence[Drive]) -> list[Drive]:
-    """Drives up to the step in which the last robot reaches its last way-point, if limited."""
+    """Drives up to the last arrival at a last way-point."""
     if not world.way_point_count:
         return list(drives)
     moving = [np.flatnonzero(drive.steps.any(axis=1)) for drive in drives]
@@ -284,7 +284,7 @@ def _add_claims(
     ],
     seed: int,
 ) -> Detections:
-    """Measurements of visible points with individual covariances and matching errors."""
+    """Measurements with individual covariances and matching errors."""
     assert world.landmark_claims is not None
     points = world.landmark_form == "points"
     random = generator(seed, robot.id, "claims")
@@ -314,7 +314,6 @@ def _add_claims(
 def _read(
     world: SimulatedWorld, sensor: Sensor, seen: Visible, seed: int, *names: str
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
-    """Measured ranges and bearings, with random numbers of this purpose."""
     errors = generator(seed, *names).standard_normal((len(seen.steps), 2))
     if sensor.range_white < 1.0 or sensor.bearing_white < 1.0:
         lasting = generator(seed, *names, "persistent").standard_normal((len(seen.steps), 2))
@@ -391,7 +390,7 @@ INNER = 0.1
 
 
 def laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
-    """Draw landmark_count points of the square, rounded down to equal rooms."""
+    """Draw landmark_count points, rounded down to equal rooms."""
     if world.layout == "twins":
         return _twins(world, rng)
     side = world.size_m / world.rooms

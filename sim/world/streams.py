@@ -1,8 +1,8 @@
-"""Streams of a simulated or recorded world: each robot's measurements in order, and the truth.
+"""Streams of a world: each robot's measurements in order, and the truth.
 
 One counter spans a robot's measurements in the order (stamp, kind); measurement 0 is the initial
-pose. Odometry intervals are contiguous and stamped with their *end*, so at equal stamps the
-measurements at the end of an interval come before it. SI units, radians, bearings in (−π, π].
+pose. Odometry intervals are contiguous and stamped with their *end*: at equal stamps the
+measurements at the end of an interval come before it.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,7 +22,7 @@ NO_LABEL = 2**32 - 1
 
 @dataclass(frozen=True)
 class StartPose:
-    """Pose (x, y, θ) of measurement 0 in the team's frame; covariance None: exact."""
+    """Pose (x, y, θ) in the team's frame; covariance None: exact."""
 
     pose: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"] | None
@@ -30,12 +30,11 @@ class StartPose:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Odometry intervals: end stamp, length, mean forward speed [m/s] and yaw rate [rad/s].
+    """Odometry: end stamp, length, mean forward speed [m/s] and yaw rate [rad/s].
 
-    Interval k ends where k + 1 begins. steered: a car's, with wheel speed [m/s] and steering angle
-    [rad]. increments: measured motions instead, poses (x, y, theta) of the end in the frame of the
-    start; speeds are then zero. covariances: of the increments, in the frame of the end. A NaN
-    increment: the interval has speeds; a NaN covariance: none.
+    steered: a car's wheel speed [m/s] and steering angle [rad] instead. increments: motions
+    instead, poses (x, y, theta) of the end in the frame of the start; speeds are then zero.
+    covariances: of the increments, in the frame of the end. NaN: absent.
     """
 
     end_ns: Int64[np.ndarray, " I"]
@@ -81,12 +80,11 @@ COLUMNS = ("ids", "ranges", "bearings", "points", "covariances", "signatures", "
 class Detections:
     """M range-bearing messages: message m has the rows offsets[m] … offsets[m + 1].
 
-    ids: landmark identities, or indices of teammates. points: measured (x, y) in the sensor frame
-    [m], from which ranges and bearings are computed. covariances: (rr, rb, bb) of range and bearing
-    or (xx, xy, yy) of points. A NaN point was measured as range and bearing; a NaN covariance is
-    absent; rows of a message are alike. hidden: messages published without identities (None: none),
-    whose ids are for scoring, NO_LABEL for clutter. signatures: similar numbers for the same
-    landmark, hidden ones only. classes: ln P(reported class | class) of each, hidden ones only.
+    ids: landmarks, or indices of teammates. points: measured (x, y) in the sensor frame [m], NaN
+    for a range and bearing. covariances: (rr, rb, bb), or (xx, xy, yy) of points, NaN if absent;
+    rows of a message are alike. hidden: messages published without identities (None: none), whose
+    ids are for scoring, NO_LABEL for clutter. signatures: similar numbers for the same landmark.
+    classes: ln P(reported class | class); both of hidden ones only.
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -157,11 +155,10 @@ class RobotStream:
     stamps_ns and rows.
 
     start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth
-    (x, y, θ) in the team's frame at truth_ns. clock_offset_ns: stamps are team time; published
-    odometry stamps read this much less. positions: by another sensor, such as GPS, in its own
-    frame, for scoring. fixes: measured (x, y) [m] in the survey's frame, with their covariances
-    (xx, xy, yy) [m²], NaN if not stated. Raises ValueError for a measurement before the initial
-    pose, or non-contiguous odometry.
+    (x, y, θ) in the team's frame at truth_ns. clock_offset_ns: published odometry stamps read this
+    much less. positions: of another sensor, in its own frame, for scoring. fixes: (x, y) [m] in the
+    survey's frame, with covariances (xx, xy, yy) [m²], NaN if not stated. Raises ValueError for a
+    measurement before the initial pose, or non-contiguous odometry.
     """
 
     robot: str
@@ -216,7 +213,7 @@ class RobotStream:
         return len(self.kinds)
 
     def until(self, end_ns: int) -> "RobotStream":
-        """Stream up to the last odometry interval that ends by end_ns, with the truth of it."""
+        """Stream up to the last odometry interval that ends by end_ns."""
         intervals = self.intervals.where(self.intervals.end_ns <= end_ns)
         last_ns = int(intervals.end_ns[-1]) if len(intervals.end_ns) else end_ns
         truth_ns, truth = self.truth_ns, self.truth
@@ -238,10 +235,7 @@ class RobotStream:
 
 @dataclass(frozen=True)
 class WorldStreams:
-    """Streams of a team, true landmark positions (None: unknown), and source name.
-
-    landmark_ids ascend; empty without positions.
-    """
+    """Streams of a team, true landmarks by ascending ids (None: unknown), and source name."""
 
     streams: tuple[RobotStream, ...]
     landmark_ids: UInt32[np.ndarray, " L"]
@@ -251,13 +245,13 @@ class WorldStreams:
 
     @property
     def spans_ns(self) -> dict[str, tuple[int, int]]:
-        """Times of each robot's first and last measurement."""
+        """First and last stamp of each robot."""
         return {
             each.robot: (int(each.stamps_ns[0]), int(each.stamps_ns[-1])) for each in self.streams
         }
 
     def order(self) -> tuple[Int64[np.ndarray, " A"], Int64[np.ndarray, " A"]]:
-        """Stream indices and counters of all measurements by (stamp, stream, counter)."""
+        """Stream indices and counters by (stamp, stream, counter)."""
         lengths = [len(stream) for stream in self.streams]
         stream = np.repeat(np.arange(len(lengths), dtype=np.int64), lengths)
         counter = np.concatenate([np.arange(n, dtype=np.int64) for n in lengths])
@@ -274,7 +268,7 @@ def grouped(
     points: Float[np.ndarray, "R 2"] | None = None,
     covariances: Float[np.ndarray, "R 3"] | None = None,
 ) -> Detections:
-    """Group ordered measurements into one message per stamp and form."""
+    """Group ordered rows into one message per stamp and form."""
     bare = np.zeros(len(stamps_ns), np.bool_)
     polar = bare if points is None else np.isnan(points[:, 0])
     unclaimed = bare if covariances is None else np.isnan(covariances[:, 0])

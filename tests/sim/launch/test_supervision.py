@@ -6,8 +6,8 @@ import pytest
 
 from teamslam.sim.launch import launch as launching
 from teamslam.sim.launch.launch import enter_team
-from teamslam.sim.launch.processes import Starter
-from teamslam.sim.launch.supervision import Child, Silence, Supervised, end_all, supervise
+from teamslam.sim.launch.processes import Child, end_all, environment_of
+from teamslam.sim.launch.supervision import Silence, Supervised, supervise
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Sample
 from teamslam.team.wire.zenoh.bus import ZenohBus
@@ -112,7 +112,10 @@ def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
     """The router restarts at its former address before the team receives it."""
     monkeypatch.setattr(launching, "ROUTER_PATIENCE_S", 120.0)  # a busy machine
     router = Supervised(
-        "router", ["router", "--listen", "tcp/127.0.0.1:0"], tmp_path, Starter(time.time_ns())
+        "router",
+        ["router", "--listen", "tcp/127.0.0.1:0"],
+        tmp_path,
+        environment_of(time.time_ns()),
     )
     tried: list[str] = []
 
