@@ -1,13 +1,13 @@
 """Storms on a team without a centre: does every peer end with the central run's map, to the bit?
 
-`python -m tests.trials.agreement [CASE…] [--utias FOLDER] [--json FILE]`, in memory. Each case
-runs with a centre, then as peers in three ways: with a centre as one more peer, without, and with
-one that dies half way and returns at the end. Between robots 20 % of the messages are lost, 10 %
-come twice, up to 2 s late; there are random partitions and 30 deaths, each of which may tear the
-end of a disk; the second robot joins at half time, the last one only meets the first. CASE is a
-scenario, `eight`, or `utias-6`; `@100` limits it to so many steps or seconds; with `/withdrawn` an
-operator withdraws the second robot half way, and only the first receives it. --json FILE stores
-each row; stored rows are not run again.
+    python -m tests.trials.agreement [CASE…] [--utias FOLDER] [--json FILE]
+
+Each case runs in memory with a centre, then as peers in three ways: with a centre as one more
+peer, without, and with one that is down in the second half. 20 % of the messages are lost, 10 %
+come twice, up to 2 s late; partitions are random, and each of 30 deaths may tear the end of a
+disk; the second robot joins at half time, the last one meets only the first. CASE is a scenario,
+`eight`, or `utias-6`, with `@100` for the first 100 steps or seconds, and with `/withdrawn` for an
+order against the second robot at half time, which only the first receives.
 """
 
 import argparse
@@ -149,7 +149,6 @@ def order_of(robot: str) -> Member:
 
 
 def central_map(scenario: Scenario, samples: list[Sample], order: Member | None) -> bytes:
-    """Final map of a central run, with the order before the streams' end."""
     if order is None:
         return encoded(final_map(samples))
     node = CentralNode(scenario.central, [each.id for each in scenario.robots])
@@ -170,7 +169,6 @@ def span_of(streams: WorldStreams) -> tuple[int, int]:
 
 def outcome(case: str, way: str, scenario: Scenario, expected: bytes, *, withdrawn: bool,
             submaps: set[bytes]) -> dict[str, object]:  # fmt: skip
-    """Run one storm: peers with the central run's bytes, and counts of the events."""
     streams = streams_of(scenario)
     begin_ns, end_ns = span_of(streams)
     storm = Storm(scenario, way, begin_ns, end_ns, 1, withdrawn)
@@ -224,7 +222,6 @@ def storms(case: str, ways: list[str], utias: Path) -> Iterator[dict[str, object
 
 
 def main() -> int:
-    """Run and print; return 1 where any map differs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("cases", nargs="*", default=["thesis", "random-10", "eight"])
     parser.add_argument("--ways", nargs="*", default=list(WAYS))

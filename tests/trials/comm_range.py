@@ -1,9 +1,10 @@
 """The gain by communication: error of each robot's own map and pose, by the range of its radio.
 
-`python -m tests.trials.comm_range [--steps N] [--picture docs/static/comm_range.png]`: `random-10`
-without a centre, in memory, with radios of 5, 10, 20, 40 m and unlimited. Over team time, against
-the truth: the error of each robot's position (`team/pose`, or else its own pose), the error and
-number of the landmarks of its team map. No alignment: known initial poses give the frame.
+    python -m tests.trials.comm_range [--steps N] [--picture docs/static/comm_range.png]
+
+`random-10` without a centre, in memory. Over team time: the error of each robot's position
+(`team/pose`, or else its own pose), and the error and number of its map's landmarks, without
+alignment.
 """
 
 import argparse
@@ -97,7 +98,6 @@ def _true(stream: RobotStream, stamp_ns: int) -> NDArray[np.float64]:
 def _held(
     times: NDArray[np.float64], said: list[Any], column: int, before: float = np.nan
 ) -> NDArray[np.float64]:
-    """The last message at each time."""
     stamps = [each[0] for each in said]
     at = np.searchsorted(stamps, times, side="right") - 1
     values = np.array([each[column] for each in said] or [before])
@@ -105,7 +105,6 @@ def _held(
 
 
 def drawn(found: dict[str, Rows], path: Path) -> None:
-    """Three pictures one above the other, a line for each range."""
     figure, axes = plt.subplots(3, 1, figsize=(8.0, 8.5), sharex=True)
     rows = (("pose_m", "error of a robot's\nposition [m], RMS"),
             ("map_m", "error of its map's\nlandmarks [m], RMS"),

@@ -2,12 +2,10 @@
 
     python -m tests.trials.cuts --runs 10 --cuts 5 [--longest 12] [--json FILE]
 
-Needs root and `ip` (Linux). Router, world, recorder, centre and robots hang on one bridge; a cut
-takes one process's link down, for less or more than a connection's lease. Each run is a short
-world; its final map is compared byte by byte with that of the same team in memory, its log with
-the streams' last counts. --json FILE stores each run; only missing runs are made. Ends with 1
-unless every process ended with 0, with this map, and without a hole that `teamslam log check`
-misses.
+Needs root and `ip` (Linux). A cut takes one process's link down, for less or more than a
+connection's lease. The final map of each short run is compared with that of the same team in
+memory, byte by byte, its log with the streams' last counts. Ends with 1 unless every process ended
+with 0, with this map, and without a hole that `teamslam log check` misses.
 """
 
 import argparse
@@ -95,7 +93,6 @@ class Team:
             self.start(node)
 
     def start(self, node: str) -> None:
-        """Start or restart a node."""
         with (self.folder / "run" / f"{node}.log").open("ab") as said:
             self.started[node] = subprocess.Popen(
                 ["ip", "netns", "exec", self.names[link_of(node)], *self.told[node]],
@@ -150,7 +147,6 @@ def disturb(run: Run, team: Team, options: argparse.Namespace) -> None:
 def play(
     number: int, folder: Path, told: Commands, expected: bytes, options: argparse.Namespace
 ) -> Run:
-    """Run a team to its final map."""
     run = Run(number)
     (folder / "run").mkdir()
     with network([link_of(node) for node in told]) as names:

@@ -1,9 +1,9 @@
 """The cost of a peer's fold: CPU of a robot that folds always, on request, or at the end only.
 
-`python -m tests.trials.fold_cost [SCENARIO] [--steps N]`, in memory, all in reach. The first robot
-folds as the set grows; the second on request, after one and two thirds; the others at the end. For
-each: CPU time in total, of its fold until the streams end, and of its fold in all. A robot that
-never folds needs the total less its fold.
+    python -m tests.trials.fold_cost [SCENARIO] [--steps N]
+
+In memory, all in reach; the second robot folds after one and two thirds. For each way: CPU time in
+total, of its fold until the streams end, of its fold in all, and of the rest.
 """
 
 import argparse
@@ -49,8 +49,6 @@ class Clock:
 
 
 class TimedFold(PeerFold):
-    """A fold whose CPU time is counted."""
-
     clock: Clock
 
     def _give(self, message: m.Message) -> list[Outgoing]:
@@ -80,7 +78,6 @@ class Timed(PeerRobot):
 
 
 def measured(name: str, steps: int) -> dict[str, Any]:
-    """CPU seconds of each way to fold."""
     scenario = with_options(load(name), centre=False)
     world = scenario.world
     assert isinstance(world, SimulatedWorld)

@@ -1,9 +1,10 @@
 """The effort until all robots have all data again, after two halves of a team have been apart.
 
-`python -m tests.trials.healing [--teams 2 5] [--topologies all line]`: the peers of
-`benchmarks.peers`, each with a submap every 10 s, one after the other; two halves are apart from
-100 s to 200 s. From the healing on, by steps of 0.05 s: the seconds until all have everything that
-existed then, and per robot the bytes sent and received, and the missing ones. Links have no limit.
+    python -m tests.trials.healing [--teams 2 5] [--topologies all line]
+
+The peers of `benchmarks.peers`, each with a submap every 10 s, are apart from 100 s to 200 s. From
+then on, by steps of 0.05 s: the seconds until all have everything that existed then, and per robot
+the bytes sent, received and missing.
 """
 
 import argparse
@@ -67,7 +68,6 @@ def healed(topology: str, robots: int) -> dict[str, float]:
 
 
 def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
-    """Measure and print; return 1 where they did not agree."""
     options = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))
     wholes = [each for each in TOPOLOGIES if each != "partition"]

@@ -3,12 +3,11 @@
     python -m tests.trials.hostile [--mutated 1000000] [--messages 100000] [--through 20000]
                                  [--keys] [--json FILE]
 
-Door: mutated payloads of every message are decoded; any error but `WireError` has escaped. Nodes:
-a stranger publishes valid dishonest messages and mutated ones on all keys of a team of processes.
-Without keys no process may die and no fault be set aside; orders and ends of the run are left out,
-and docs/decisions/09-keys-and-access-control.md states the effects on the map. With --keys the
-stranger has the team's certificate of a robot outside the scenario and sends everything; the final
-map must be that of the same team in memory. Ends with 1 if any of this does not hold.
+Door: any error but `WireError` has escaped. Nodes: a stranger publishes on all keys of a team of
+processes. Without keys no process may die and no fault be set aside; orders and ends of the run
+are left out (docs/decisions/09-keys-and-access-control.md states the effects on the map). With
+--keys the stranger has the certificate of a robot outside the scenario and sends everything; the
+final map must be that of the same team in memory. Ends with 1 if any of this does not hold.
 """
 
 import argparse
@@ -93,7 +92,6 @@ def storm(bus: ZenohBus, options: argparse.Namespace, launch: subprocess.Popen[b
 
 
 def nodes(options: argparse.Namespace) -> dict[str, object]:
-    """Run a team with a stranger in it; return the outcome."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place).resolve()
         scenario = shortened(folder, options.steps)

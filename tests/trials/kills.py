@@ -119,7 +119,6 @@ def lacking(folder: Path) -> list[str]:
 
 
 def final_in(folder: Path) -> bytes | None:
-    """The final map's bytes in the run's log, or in a part of it."""
     for path in sorted((folder / "run").glob("log*.mcap")):
         with suppress(LogError, OSError):
             for sample in open_log(path).samples((FINAL_MAP,)):
@@ -134,14 +133,12 @@ def shortened(folder: Path, steps: int) -> Path:
 
 
 def expected_of(scenario: Scenario) -> bytes:
-    """The final map's bytes of an undisturbed team."""
     samples = run_team(scenario, streams_of(scenario))
     (expected,) = [s.payload for s in samples if s.key == FINAL_MAP.key()]
     return expected
 
 
 def await_text(path: Path, text: str, patience_s: float = 120.0) -> str:
-    """Wait for a text in a file; return the text behind it."""
     end = time.monotonic() + patience_s
     while not (path.exists() and text in path.read_text("utf-8", "replace")):
         if time.monotonic() > end:
@@ -151,7 +148,6 @@ def await_text(path: Path, text: str, patience_s: float = 120.0) -> str:
 
 
 def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespace) -> Run:
-    """Launch, kill or stop, wait, compare."""
     rng = random.Random(f"{options.seed} {number}")
     run = Run(number)
     with tempfile.TemporaryDirectory() as name:

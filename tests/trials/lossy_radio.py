@@ -2,11 +2,9 @@
 
     sudo python -m tests.trials.lossy_radio --runs 1 --loss 15,25,30 --delay 60,120,150
 
-Needs root and `ip` (Linux). Robot r1 is in one network namespace, all others in another; loss [%]
-and delay [ms] hold in each direction. The link is cut --cuts times for --cut seconds. A run is
-good if all processes ended with 0 and the final map equals, byte by byte, that of the same team in
-memory; or if all are alive at the time limit. --open: without keys. Ends with 1 unless all are
-good.
+Needs root and `ip` (Linux). Robot r1 is in one network namespace, all others in another. A run is
+good if all processes ended with 0 and the final map equals that of the same team in memory, or if
+all are alive at the time limit. Ends with 1 unless all are good.
 """
 
 import argparse
@@ -139,7 +137,6 @@ def tun_in(namespace: str) -> int:
 
 @contextmanager
 def radio(loss: int, delay_ms: int, seed: str) -> Iterator[tuple[str, str, Radio]]:
-    """Two namespaces, of the team and of the far robot, with a bad link."""
     home, away = (f"teamslam-{os.getpid()}-{side}" for side in ("home", "away"))
     made: list[str] = []
     link = None

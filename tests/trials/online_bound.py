@@ -1,10 +1,8 @@
 """Bound of online poses: the batch estimate of all measurements of the team until then.
 
-The batch smoother of all robots' measurements up to t, marginalised to the poses at t: an extended
-Kalman filter over all poses and landmarks with Jacobians at the true state. Without delay, submaps
-or linearisation error, it bounds the mean accuracy of any estimator; a robot's RMSE over this
-one's is the estimator's share. For simulated worlds with known initial poses and one noise per
-second; the models are independent implementations.
+An extended Kalman filter over the poses at t and all landmarks, with Jacobians at the true state:
+without delay, submaps or linearisation error it bounds the mean accuracy of any estimator. For
+simulated worlds with known initial poses and one noise per second; its models are its own.
 """
 
 from typing import NamedTuple
@@ -32,7 +30,6 @@ class Bounded(NamedTuple):
     headings: np.ndarray
 
     def rmse_m(self, stamps_ns: np.ndarray) -> float:
-        """RMSE [m] of the positions at these stamps."""
         at = np.isin(self.stamps_ns, stamps_ns)
         return float(np.sqrt(np.mean(np.sum(self.errors[at, :2] ** 2, axis=1))))
 
@@ -70,7 +67,6 @@ class Bounded(NamedTuple):
 
 
 def bounds(scenario: Scenario, world: WorldStreams) -> dict[str, Bounded]:
-    """Errors and covariances of each robot after each odometry interval."""
     filter_ = _AtTruth(world)
     found: dict[str, list[tuple[int, np.ndarray, np.ndarray, float]]] = {
         config.id: [] for config in scenario.robots
@@ -138,7 +134,6 @@ class _AtTruth:
         self._P[at, at] += G @ Q @ G.T
 
     def look(self, robot: int, stream: RobotStream, counter: int, config: RobotConfig) -> None:
-        """Use ranges and bearings of landmarks from the robot's true pose."""
         seen = stream.landmark_detections
         at = seen.rows(int(stream.rows[counter]))
         scan = seen.ids[at], seen.ranges[at], seen.bearings[at]

@@ -2,13 +2,11 @@
 
     python -m tests.trials.online_poses [SCENARIO …] [--seeds FIRST-LAST] [--json FILE]
 
-For each scenario: the mean NEES per degree of freedom of the online poses (1 is right), median and
-worst RMSE of a robot in a run, and silent robots: more than a window of poses in a row with a NEES
-of probability below 10⁻⁹, without a warning. Beside each RMSE that of the bound
-(`online_bound.py`) in the same run at the same stamps: the worst over the median is due to the
-world, the RMSE over the bound's to the estimator. FILE is written after each seed; stored seeds
-are not run again. Seeds 5000 to 5999 are for headline figures (decision 21), not for tuning. Exit
-status 1 if a goal of GOALS is missed.
+For each scenario: the mean NEES per degree of freedom of the online poses, median and worst RMSE
+of a robot in a run beside that of the bound (`online_bound.py`), and silent robots: more than a
+window of poses in a row with a NEES of probability below 10⁻⁹, without a warning. Stored seeds are
+not run again; seeds 5000 to 5999 are for headline figures (decision 21). Exit status 1 if a goal of
+GOALS is missed.
 """
 
 import argparse
@@ -36,7 +34,6 @@ GOALS = {"nees_per_dof": 1.15, "worst_over_median": 3.0, "over_bound": 1.25, "si
 
 
 def run(scenario_name: str, seed: int) -> list[dict[str, Any]]:
-    """One run: figures of each robot, and the longest time that it was far off and silent."""
     scenario = with_options(load(scenario_name), seed=seed)
     window_ns = round(max(r.front_end.window_s for r in scenario.robots) * 1e9)
     nodes: dict[str, RobotNode] = {}

@@ -2,9 +2,8 @@
 
     python -m tests.trials.robust_cost [--profiles NAME …] [--seeds FIRST-LAST] [--dataset ZIP …]
 
-The team runs in memory, twice for each seed: with the windows' gate against outliers, and without.
-On data sets (UTIAS) the seed is that of the particles, and the errors are aligned. The submaps are
-joined again with parts of the default left out:
+The team runs in memory with and without the windows' gate; its submaps are joined with parts of
+the default left out:
 
     default   the robust loss, the shared errors as states, the gate
     squares   least squares in place of the loss
@@ -12,8 +11,8 @@ joined again with parts of the default left out:
     no states and no shared errors
 
 A line gives the ratio of the default's RMSE to each (geometric mean over the seeds, with standard
-error) and the mean NEES per degree of freedom. Exit status 1 if the default is more than 2 % worse
-than `no gate`, or its NEES is outside [0.95, 1.05], by two standard errors.
+error; aligned for data sets) and the mean NEES per degree of freedom. Exit status 1 if the default
+is more than 2 % worse than `no gate`, or its NEES is outside [0.95, 1.05], by two standard errors.
 """
 
 import argparse
@@ -63,7 +62,6 @@ def log_of(scenario: Scenario) -> list[Sample]:
 def joined(
     samples: Sequence[Sample], *, is_robust: bool, has_biases: bool, is_aligned: bool
 ) -> Figures:
-    """Join the submaps of a log; return the errors of the landmarks."""
     fold = final_fold(samples, is_robust=is_robust, has_biases=has_biases)
     ids, means, covariance = landmark_map(fold)
     message = collect_log(samples).newest(ch.TRUTH_LANDMARKS, m.TruthLandmarks)
@@ -77,7 +75,6 @@ def joined(
 
 
 def variants(scenario: Scenario, *, is_aligned: bool) -> Iterator[tuple[str, Figures]]:
-    """Figures of each variant of one seed."""
     of = partial(joined, is_aligned=is_aligned)
     samples = log_of(scenario)
     yield "default", of(samples, is_robust=True, has_biases=True)

@@ -1,10 +1,9 @@
 """The walk of one measurement: the files and functions between a scan and the prior that returns.
 
-`python -m tests.trials.walk [SCENARIO] [--final] [--functions]`, in memory. A profiler around
-`handle` of every robot and of the centre collects the functions entered until the last running
-map: scan, keyframe, closed window, filing, fold, prior. `--final` adds the final map. For each
-file: its lines, those of the functions entered, and the files that call it. `--functions` lists
-the functions with their numbers of calls.
+    python -m tests.trials.walk [SCENARIO] [--final] [--functions]
+
+A profiler around `handle` of every robot and of the centre, in memory, until the last running map.
+For each file: its lines, those of the functions entered, and the files that call it.
 """
 
 import argparse
@@ -44,7 +43,6 @@ class Walk:
     _product: dict[str, bool] = field(default_factory=dict)
 
     def around(self, node: RobotNode | CentralNode) -> None:
-        """Profile a node's `handle`."""
         handle = node.handle
 
         def profiled(message: m.Message) -> Any:
@@ -121,7 +119,6 @@ def _relative(name: str) -> str:
 
 
 def walked(scenario_name: str, *, final: bool) -> Walk:
-    """Run a scenario in memory with every node profiled."""
     walk, scenario = Walk(final), load(scenario_name)
 
     def robot(config: RobotConfig, exchange: Exchange) -> RobotNode:

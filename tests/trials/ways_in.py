@@ -5,14 +5,12 @@
 zip      the data set as it is
 csv      a folder of tables
 mcap, db3  ROS 2 bags of it (odometry as twists, detections as points), imported
-rmw, bridge  the bag's bytes published on rmw_zenoh's and on zenoh-bridge-ros2dds' keys by an
-         independent process, at so many times real time, to a `teamslam driver` per robot and a
-         live team of processes
+rmw, bridge  the bag's bytes on rmw_zenoh's and on zenoh-bridge-ros2dds' keys, from an independent
+         process, to a `teamslam driver` per robot and a live team of processes
 log      the log of such a live team, imported
 
 A range and bearing become a point in a bag, which costs the last bit: the first two maps must be
-equal byte for byte, and so must the other five, whose distance from the first is printed. --keep:
-reuse finished ways from the folder. Ends with 1 where maps differ.
+equal byte for byte, and so must the other five. Ends with 1 where maps differ.
 """
 
 import argparse
@@ -65,7 +63,6 @@ ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 
 
 def of_robot(stream: RobotStream) -> list[ros.Message]:
-    """All measurements of a robot, as messages."""
     found: list[ros.Message] = []
     intervals = stream.intervals
     begins = (intervals.end_ns - intervals.duration_ns).tolist()
@@ -173,7 +170,6 @@ def of_data_set(scenario: Scenario) -> tuple[bytes, bytes, bytes]:
 
 
 def of_log(log: Path) -> tuple[bytes, bytes, bytes]:
-    """The same of the final map in a log."""
     last = list(open_log(log).samples([ch.FINAL_MAP]))[-1]
     found = opened(last)[2]
     assert isinstance(found, FusedMap)
@@ -189,7 +185,6 @@ def typed(*words: object) -> str:
 
 
 def imported(source: Path, folder: Path, *options: object) -> Scenario:
-    """A bag or a log as a data set."""
     shutil.rmtree(folder, ignore_errors=True)
     print(typed("import", source, "-o", folder, *options).strip().splitlines()[-2], flush=True)
     return with_options(load(folder / "scenario.toml"), dataset=folder)
@@ -254,7 +249,6 @@ def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
 
 
 def awaited(log: Path, text: str, team: "subprocess.Popen[str]") -> None:
-    """Return when a log has the text."""
     until = time.monotonic() + 400.0
     while text not in log.read_text():
         if time.monotonic() > until or team.poll() is not None:
@@ -354,7 +348,6 @@ def judged(maps: dict[str, tuple[bytes, bytes, bytes]]) -> bool:
 
 
 def apart(one: tuple[bytes, bytes, bytes], other: tuple[bytes, bytes, bytes]) -> str:
-    """The largest difference of two maps."""
     if one[0] != other[0]:
         return "other landmarks"
     means, covariances = (

@@ -7,7 +7,6 @@ from teamslam.central.join_messages import Shown, reasons
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.association.landmark_sets import (
     OPEN,
-    Landmarks,
     Opened,
     Verdict,
 )
@@ -74,15 +73,6 @@ def test_a_loop_without_names_is_the_map_with_names(loop):
     )
     agreement = marginals.joint_cost(fold)
     assert 0.7 < agreement.chi2 / agreement.dof < 1.3
-
-
-def test_the_fold_repeats_its_bits_and_submaps_with_names_add_no_set(loop):
-    submaps, _, fold = loop
-    again = _folded(submaps)
-    assert again.main.state.tobytes() == fold.main.state.tobytes()
-    assert again.landmarks.sets == fold.landmarks.sets
-    named, _ = drive("r1", LOOP, _world(5), np.random.default_rng(5), named=True)
-    assert _folded(named[:5]).landmarks == Landmarks() or not _folded(named[:5]).landmarks.sets
 
 
 def test_a_loop_of_small_uncertainty_closes_by_a_few_landmarks_that_agree():

@@ -104,19 +104,6 @@ def test_joined_submaps_equal_the_batch_over_all_raw_measurements(length):
 # --- a function of the set, not of its order ---
 
 
-@settings(deadline=None, max_examples=10)
-@given(st.randoms(use_true_random=False))
-def test_every_order_of_arrival_sorted_canonically_gives_the_same_bytes(random):
-    world = team(1, robots=3, submaps=4)
-    arrived = list(world.submaps)
-    random.shuffle(arrived)
-    straight = joined(world.submaps, world.starts)
-    sorted_again = joined(sorted(arrived, key=lambda each: each.key), world.starts[::-1])
-    assert straight.main.state.tobytes() == sorted_again.main.state.tobytes()
-    for one, other in zip(landmark_map(straight), landmark_map(sorted_again), strict=True):
-        assert one.tobytes() == other.tobytes()
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
     world = team(seed, robots=3, submaps=10)
