@@ -82,7 +82,10 @@ class Answers:
             case m.Trajectory():
                 return self._trajectory(message)
             case m.Status():
-                return [self._diagnostics(message)]
+                content = ros.diagnostics(
+                    message.stamp_ns, message.node, message.state, message.warnings, message.figures
+                )
+                return [_answer("/diagnostics", message.stamp_ns, content)]
             case _:
                 return []
 
@@ -91,13 +94,8 @@ class Answers:
         pose, P = (x, y, theta), floats(message.covariance, "covariance").reshape(3, 3)
         stamp_ns, names = message.stamp_ns, self.names
         self._extend_path(stamp_ns, pose)
-        out = [
-            self._answer(
-                names.topic("team_pose"), "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns,
-                ros.pose_with_covariance(stamp_ns, names.map_frame, pose, P),
-            ),
-            *self._path_if_due(stamp_ns),
-        ]  # fmt: skip
+        content = ros.pose_with_covariance(stamp_ns, names.map_frame, pose, P)
+        out = [_answer(names.topic("team_pose"), stamp_ns, content), *self._path_if_due(stamp_ns)]
         odom = self._odometry_at(stamp_ns)
         if odom is not None:
             self._map_from_odom = compose(pose, inverse(odom))
@@ -109,8 +107,7 @@ class Answers:
             return []
         self._shown = self._count, stamp_ns
         content = ros.path(stamp_ns, self.names.map_frame, self._path)
-        topic = self.names.topic("team_path")
-        return [self._answer(topic, "nav_msgs/msg/Path", stamp_ns, content, latched=True)]
+        return [_answer(self.names.topic("team_path"), stamp_ns, content, latched=True)]
 
     def transform(self, stamp_ns: int) -> list[Answer]:
         """Return the newest map → odom, valid at a time; empty before the first pose in the map."""
@@ -118,7 +115,7 @@ class Answers:
             return []
         names = self.names
         one = ros.transform(stamp_ns, names.map_frame, names.odometry_frame, self._map_from_odom)
-        return [self._answer(names.tf, "tf2_msgs/msg/TFMessage", stamp_ns, ros.transforms(one))]
+        return [_answer(names.tf, stamp_ns, ros.transforms(one))]
 
     def _odometry_at(self, stamp_ns: int) -> Pose | None:
         held = self._odometry
@@ -148,7 +145,7 @@ class Answers:
         smoothed = [(t, (x, y, theta)) for t, (x, y, theta) in zip(times, poses, strict=True)]
         content = ros.path(message.stamp_ns, self.names.map_frame, smoothed)
         topic = self.names.topic("smoothed_path")
-        return [self._answer(topic, "nav_msgs/msg/Path", message.stamp_ns, content, latched=True)]
+        return [_answer(topic, message.stamp_ns, content, latched=True)]
 
     def _map(self, message: m.FusedMap) -> list[Answer]:
         numbers = ids(message.ids, "ids").tolist()
@@ -159,25 +156,14 @@ class Answers:
         labels = [str(n if n < UNNAMED else n - UNNAMED) for n in numbers]
         drawn = ros.markers(stamp_ns, frame, labels, means, blocks, named)
         listed = ros.detections(stamp_ns, frame, [str(n) for n in numbers], means, blocks)
-        topics = self.names.topic("team_landmarks"), self.names.topic("team_map")
-        kinds = "visualization_msgs/msg/MarkerArray", "vision_msgs/msg/Detection3DArray"
         return [
-            self._answer(topics[0], kinds[0], stamp_ns, drawn, latched=True),
-            self._answer(topics[1], kinds[1], stamp_ns, listed, latched=True),
+            _answer(self.names.topic("team_landmarks"), stamp_ns, drawn, latched=True),
+            _answer(self.names.topic("team_map"), stamp_ns, listed, latched=True),
         ]
 
-    def _diagnostics(self, status: m.Status) -> Answer:
-        content = ros.diagnostics(
-            status.stamp_ns, status.node, status.state, status.warnings, status.figures
-        )
-        kind = "diagnostic_msgs/msg/DiagnosticArray"
-        return self._answer("/diagnostics", kind, status.stamp_ns, content)
 
-    @staticmethod
-    def _answer(
-        topic: str, kind: str, stamp_ns: int, message: Any, *, latched: bool = False
-    ) -> Answer:
-        return Answer(topic, kind, stamp_ns, ros.encode(message), latched)
+def _answer(topic: str, stamp_ns: int, message: Any, *, latched: bool = False) -> Answer:
+    return Answer(topic, message.__msgtype__, stamp_ns, ros.encode(message), latched)
 
 
 class RosPublisher:

@@ -24,7 +24,7 @@ from teamslam.team.ros2.decoding import (
     TransformsRecord,
     decode,
 )
-from teamslam.team.ros2.frames import Frames, describe_misplacement, heading
+from teamslam.team.ros2.frames import Frames, describe_misplacement, planar
 from teamslam.team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
 from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
@@ -210,15 +210,12 @@ class Ros2Driver:
     def _report_odometry(self, record: Record) -> None:
         assert self._on_odometry is not None
         if isinstance(record, OdometryRecord):
-            x, y, _ = record.position
-            pose = x, y, heading(record.rotation)
-            self._on_odometry(record.stamp_ns, pose, record.frame, record.child)
+            self._on_odometry(record.stamp_ns, planar(record), record.frame, record.child)
         elif isinstance(record, TransformsRecord):
             frames = self._topics.odometry_frame, self._topics.base_frame
             for t in record.transforms:
                 if (t.parent, t.child) == frames:
-                    x, y, _ = t.position
-                    self._on_odometry(t.stamp_ns, (x, y, heading(t.rotation)), *frames)
+                    self._on_odometry(t.stamp_ns, planar(t), *frames)
 
     def _hand_over(self, measured: Measured) -> None:
         t = measured.stamp_ns * NANO

@@ -272,10 +272,7 @@ def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
 
 def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
     """Pack a landmark covariance: the joint one, or each landmark's own block."""
-    if joint:
-        return joint_bytes(covariance)
-    xx, xy, yy = (covariance.diagonal(k)[i::2] for k, i in ((0, 0), (1, 0), (0, 1)))
-    return from_floats(np.column_stack((xx, xy, yy)))
+    return joint_bytes(covariance) if joint else block_bytes(blocks_of(covariance))
 
 
 def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
@@ -284,10 +281,9 @@ def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:
     values = floats(message.covariance, "covariance")
     if message.joint:
         return unpacked(values, 2 * n)
-    joint = np.zeros((2 * n, 2 * n))
-    for i, (xx, xy, yy) in enumerate(values.reshape(n, 3)):
-        joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[xx, xy], [xy, yy]]
-    return joint
+    joint = np.zeros((n, 2, n, 2))
+    joint[np.arange(n), :, np.arange(n), :] = landmark_blocks_of(message)
+    return joint.reshape(2 * n, 2 * n)
 
 
 def landmark_blocks_of(message: m.MapEstimate | m.FusedMap) -> Float[np.ndarray, "L 2 2"]:

@@ -172,8 +172,7 @@ class SourceNode:
             return refused
         if message.robot != self._robot or (isinstance(message, m.Progress) and self.listening):
             return None
-        at = message.incarnation, message.measurements
-        here = self.journal.incarnation, self.journal.count(self.journal.incarnation)
+        at, here = (message.incarnation, message.measurements), self._newest
         if at > here:
             return (
                 f"consumed {at[1]} measurements of incarnation {at[0]}; "
@@ -258,16 +257,19 @@ class SourceNode:
         The robot has consumed them, the centre has acknowledged its submaps (a peer has its final
         map), and a present recorder has everything.
         """
-        newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
         incarnation, measurements, submaps = self.done
         is_joined = self.joined >= (incarnation, submaps) or not submaps or self.concluded
-        return (incarnation, measurements) >= newest and is_joined and not self.recorder_lacks
+        has_all = (incarnation, measurements) >= self._newest
+        return has_all and is_joined and not self.recorder_lacks
 
     @property
     def recorder_lacks(self) -> bool:
         """Whether a present recorder lacks measurements."""
-        newest = self.journal.incarnation, self.journal.count(self.journal.incarnation)
-        return "recorder" in self.alive and self.recorded < newest
+        return "recorder" in self.alive and self.recorded < self._newest
+
+    @property
+    def _newest(self) -> Stream:
+        return self.journal.incarnation, self.journal.count(self.journal.incarnation)
 
     @property
     def waits_for(self) -> str:

@@ -77,7 +77,7 @@ def credentials_of(
                 f"{path}: not valid before {found.not_valid_before_utc:%Y-%m-%d %H:%M} UTC; this "
                 f"machine's clock reads {now:%Y-%m-%d %H:%M}: put the clock right"
             )
-    common, owner = _read_names(certificate)
+    common, owner = read_names(certificate)
     if not re.fullmatch(rf"{re.escape(node)}(\.\d+)?", common):
         raise KeysError(f"{paths[1]}: a certificate of {common!r}, not of {node}: {_REMEDY}")
     if team is not None and owner != team:
@@ -115,9 +115,10 @@ def _check_fit(
         ) from None
 
 
-def _read_names(certificate: x509.Certificate) -> tuple[str, str]:
-    found = []
-    for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME):
-        values = certificate.subject.get_attributes_for_oid(oid)
-        found.append(str(values[0].value) if values else "")
-    return found[0], found[1]
+def read_names(certificate: x509.Certificate) -> tuple[str, str]:
+    """Return node and team in a certificate; empty where it has none."""
+    common, owner = (
+        next((str(each.value) for each in certificate.subject.get_attributes_for_oid(oid)), "")
+        for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME)
+    )
+    return common, owner

@@ -10,9 +10,8 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 
-from teamslam.team.keys.credentials import Credentials
+from teamslam.team.keys.credentials import Credentials, read_names
 from teamslam.team.keys.roster import ROSTER, Issued, KeysError, load_roster
 
 _ALGORITHM = ec.ECDSA(hashes.SHA256())
@@ -75,14 +74,10 @@ def _issued(authority: x509.Certificate, team: str, node: str, certificate: byte
         found.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature):
         return "a certificate that the team's authority has not issued"
-    names = [
-        str(value.value)
-        for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATION_NAME)
-        for value in found.subject.get_attributes_for_oid(oid)[:1]
-    ]
-    named = re.fullmatch(rf"{re.escape(node)}(?:\.([1-9]\d*))?", names[0]) if names else None
-    if len(names) < 2 or names[1] != team or named is None:
-        return f"a certificate of {' of '.join(names)}, not of {node} of {team}"
+    common, owner = read_names(found)
+    named = re.fullmatch(rf"{re.escape(node)}(?:\.([1-9]\d*))?", common)
+    if owner != team or named is None:
+        return f"a certificate of {common} of {owner}, not of {node} of {team}"
     ends_ns = 10**9 * int(found.not_valid_after_utc.timestamp())
     return Issued(int(named[1] or 1), ends_ns)
 

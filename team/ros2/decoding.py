@@ -141,18 +141,10 @@ def _rotation(quaternion: Any) -> Quaternion:
 
 
 def _odometry(message: Any) -> OdometryRecord:
-    pose, twist = message.pose.pose, message.twist.twist
-    forward, left, yaw_rate = _finite((twist.linear.x, twist.linear.y, twist.angular.z))
-    return OdometryRecord(
-        stamp_ns=_stamp_ns(message.header),
-        frame=message.header.frame_id,
-        child=message.child_frame_id,
-        position=_vector(pose.position),
-        rotation=_rotation(pose.orientation),
-        forward=forward,
-        left=left,
-        yaw_rate=yaw_rate,
-    )
+    twist = message.twist.twist
+    speeds = _finite((twist.linear.x, twist.linear.y, twist.angular.z))
+    stamp_ns, frame, position, rotation = _pose(message, message.pose.pose)
+    return OdometryRecord(stamp_ns, frame, message.child_frame_id, position, rotation, *speeds)
 
 
 def _speeds(message: Any) -> SpeedRecord:

@@ -6,7 +6,7 @@ from math import atan2, pi, remainder
 
 import numpy as np
 
-from teamslam.team.ros2.decoding import Quaternion, Transform, Vector
+from teamslam.team.ros2.decoding import OdometryRecord, PoseRecord, Quaternion, Transform, Vector
 from teamslam.team.shapes import Float
 
 DEEPEST = 32  # most transforms between a sensor and its base
@@ -34,6 +34,11 @@ def heading(q: Quaternion) -> float:
 
 
 Place = tuple[float, float, float]  # a pose (x, y, yaw) on the base
+
+
+def planar(record: OdometryRecord | PoseRecord | Transform) -> Place:
+    """Return the (x, y, yaw) of a record's pose."""
+    return record.position[0], record.position[1], heading(record.rotation)
 
 
 SAME_PLACE = 1e-3  # places that differ by less [m, rad] are the same

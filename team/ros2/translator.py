@@ -19,7 +19,7 @@ from teamslam.team.ros2.decoding import (
     Transform,
     TransformsRecord,
 )
-from teamslam.team.ros2.frames import BODY, OPTICAL, Frames, Mount, heading
+from teamslam.team.ros2.frames import BODY, OPTICAL, Frames, Mount, planar
 from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
 
@@ -146,13 +146,16 @@ class Translator:
                 self.owners.add_odometry(self.robot, record.frame, record.child)
                 if self.topics.use == "twist":
                     return [Speeds(record.stamp_ns, record.forward, record.yaw_rate)]
-                x, y, _ = record.position
-                return [Pose(record.stamp_ns, x, y, heading(record.rotation))]
+                return [Pose(record.stamp_ns, *planar(record))]
             case SpeedRecord():
                 return [Speeds(record.stamp_ns, record.forward, record.yaw_rate)]
             case TransformsRecord():
                 ours = (self.topics.odometry_frame, self.topics.base_frame)
-                return [_pose(t) for t in record.transforms if (t.parent, t.child) == ours]
+                return [
+                    Pose(t.stamp_ns, *planar(t))
+                    for t in record.transforms
+                    if (t.parent, t.child) == ours
+                ]
             case _:
                 self.dropped["no odometry in a message of the odometry topic"] += 1
                 return []
@@ -160,11 +163,10 @@ class Translator:
     def _truth(self, record: Record) -> list[Measured]:
         match record:
             case OdometryRecord() | PoseRecord():
-                x, y, _ = record.position
-                return [Pose(record.stamp_ns, x, y, heading(record.rotation), truth=True)]
+                return [Pose(record.stamp_ns, *planar(record), truth=True)]
             case TransformsRecord():
-                base = self.topics.base_frame
-                return [_pose(t)._replace(truth=True) for t in record.transforms if t.child == base]
+                base = [t for t in record.transforms if t.child == self.topics.base_frame]
+                return [Pose(t.stamp_ns, *planar(t), truth=True) for t in base]
             case _:
                 self.dropped["no pose in a message of the truth topic"] += 1
                 return []
@@ -332,7 +334,3 @@ class Translator:
             break
         self.mounts[frame] = found
         return found
-
-
-def _pose(t: Transform) -> Pose:
-    return Pose(t.stamp_ns, t.position[0], t.position[1], heading(t.rotation))

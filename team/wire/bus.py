@@ -149,11 +149,11 @@ def opened(sample: Sample) -> tuple[Channel, str, m.Message]:
     robot = getattr(message, "robot", name)
     if robot != name and "{robot}" in channel.template:
         raise WireError("wrong field", f"a message of {robot!r} on the key {sample.key!r}")
-    sender = _sender_of(channel, message)
+    sender = getattr(message, "node", None) if type(message) in _WITH_NODE else None
+    if channel is ch.ORDER or channel is ch.END_ORDER:
+        sender = getattr(message, "by", None)
     if sender is not None and sender != channel.publisher(name):
-        raise WireError(
-            "wrong field", f"a message of {str(sender)[:80]!r} on the key {sample.key!r}"
-        )
+        raise WireError("wrong field", f"a message of {sender[:80]!r} on the key {sample.key!r}")
     return channel, name, message
 
 
@@ -182,13 +182,6 @@ def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, m.Mess
 
 _WITH_NODE = {m.Configuration, m.Progress, m.Status, m.Liveliness, m.Fault, m.SetSummary, m.Members}
 """Messages that name the node that sends them."""
-
-
-def _sender_of(channel: Channel, message: m.Message) -> str | None:
-    if type(message) in _WITH_NODE:
-        return message.node  # type: ignore[attr-defined, no-any-return]
-    is_order = channel is ch.ORDER or channel is ch.END_ORDER
-    return message.by if is_order and isinstance(message, m.Withdrawal | m.TeamEnd) else None
 
 
 def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:

@@ -14,9 +14,7 @@ from teamslam.team.wire.messages.base import Message
 from teamslam.team.wire.messages.maps import *
 from teamslam.team.wire.messages.measurements import *
 from teamslam.team.wire.messages.nodes import *
-from teamslam.team.wire.messages.peers import *
 from teamslam.team.wire.messages.submaps import *
-from teamslam.team.wire.messages.truth import *
 
 
 def _by_tag(base: type[Message]) -> dict[str, type[Message]]:

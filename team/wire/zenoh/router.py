@@ -19,7 +19,7 @@ from teamslam.team.wire.logs import LOG
 from teamslam.team.wire.messages import KeptRequest
 from teamslam.team.wire.zenoh.access import access_control
 from teamslam.team.wire.zenoh.attachment import AttachmentError, unpack
-from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, open_session
+from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, open_session, tls_settings
 from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 
 if TYPE_CHECKING:  # not needed without keys
@@ -78,7 +78,7 @@ def router(
         if not listen.startswith("tls/"):
             raise BusError(f"{listen}: with keys a router listens at tls/HOST:PORT")
         zenoh.init_log_from_env_or(REFUSALS)
-        settings |= _router_tls(*keys)
+        settings |= tls_settings(keys[0], "listen") | {"access_control": access_control(keys[1])}
     try:
         session = open_session(settings)
     except zenoh.ZError as error:
@@ -164,17 +164,3 @@ def _answer_door(session: zenoh.Session, roster: Roster) -> None:
             query.reply(query.key_expr, ACCEPTED if accepted else REVOKED)
 
     session.declare_queryable(f"team/{roster.team}/{DOOR}/*", Callback(answer, indirect=False))
-
-
-def _router_tls(keys: "Credentials", roster: Roster) -> dict[str, object]:
-    return {
-        "transport/link/protocols": ["tls"],
-        "transport/link/tls": {
-            "root_ca_certificate": str(keys.authority),
-            "enable_mtls": True,
-            "listen_certificate": str(keys.certificate),
-            "listen_private_key": str(keys.key),
-            "close_link_on_expiration": True,
-        },
-        "access_control": access_control(roster),
-    }

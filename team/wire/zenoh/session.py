@@ -3,7 +3,7 @@
 import json
 import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import zenoh
 from zenoh.handlers import Callback
@@ -66,7 +66,9 @@ def client(
     if keys is not None:
         if not connect.startswith("tls/"):
             raise BusError(f"{connect}: with keys a router is reached by tls/HOST:PORT")
-        settings |= _client_tls(keys)
+        settings |= tls_settings(keys, "connect") | {
+            "transport/link/tls/verify_name_on_connect": True
+        }
     deadline = time.monotonic() + patience_s
     wait_s = min(FIRST_LOOK_S, patience_s)
     while True:
@@ -93,15 +95,15 @@ def client(
                 ) from error
 
 
-def _client_tls(keys: "Credentials") -> dict[str, object]:
+def tls_settings(keys: "Credentials", role: Literal["connect", "listen"]) -> dict[str, object]:
+    """Return the settings of a link by mutual TLS."""
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": str(keys.authority),
             "enable_mtls": True,
-            "connect_certificate": str(keys.certificate),
-            "connect_private_key": str(keys.key),
-            "verify_name_on_connect": True,
+            f"{role}_certificate": str(keys.certificate),
+            f"{role}_private_key": str(keys.key),
             "close_link_on_expiration": True,
         },
     }

@@ -71,28 +71,17 @@ class StoredMessages:
         )
         reply = encoded(kept)
         decoded(reply, Kept)  # its receivers check the attachment, too
-        if channel in ENDS:
-            if isinstance(message, FusedMap) and not message.final:
-                raise WireError("wrong field", f"no final map on the key {sample.key!r}")
-            self._end(sample.key, _End(channel.name, now_s, reply, set()))
-        elif channel in ORDERS:
-            self._order(sample, channel.name, reply)
-
-    def _end(self, key: str, end: _End) -> None:
-        with self._lock:
-            if key not in self._ends and len(self._ends) >= MOST_ENDS:
-                return
-            end.missed_by.update(self._silent)
-            self._ends[key] = end
-            if key == FINAL_MAP.key():
-                self._forget_orders()
-
-    def _order(self, sample: Sample, channel: str, reply: bytes) -> None:
+        if channel in ENDS and isinstance(message, FusedMap) and not message.final:
+            raise WireError("wrong field", f"no final map on the key {sample.key!r}")
         name = sample.key, sample.payload
         with self._lock:
-            if len(self._orders) < MOST_ORDERS and name not in self._named:
+            if channel in ENDS and (sample.key in self._ends or len(self._ends) < MOST_ENDS):
+                self._ends[sample.key] = _End(channel.name, now_s, reply, set(self._silent))
+                if channel is FINAL_MAP:
+                    self._forget_orders()
+            elif channel in ORDERS and name not in self._named and len(self._orders) < MOST_ORDERS:
                 self._named.add(name)
-                self._orders[reply] = channel
+                self._orders[reply] = channel.name
 
     def _forget_orders(self) -> None:
         self._orders.clear()
