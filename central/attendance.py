@@ -15,8 +15,8 @@ MOST_NOTED = 1_000
 class Attendance:
     """The progress and presence of one robot at the centre.
 
-    done: the accepted one of the `Done` messages `dones`. began: the latest incarnation; 0: none.
-    head: its driver's newest; driver: whether that is present; None: unknown.
+    done: the accepted one of `dones`. began: the latest incarnation; 0: none. head: its driver's
+    newest; driver: whether that is present; None: unknown.
     """
 
     alive: bool = False
@@ -53,7 +53,7 @@ class Attendance:
         return (done.incarnation, done.measurements) >= (head.incarnation, head.measurements)
 
     def note_done(self, done: m.Done) -> None:
-        """Store a `Done`; that of the last incarnation counts, in whichever order they arrive."""
+        """Store a `Done`; that of the last incarnation counts."""
         if done not in self.dones:
             self.dones = [*self.dones[1 - MOST_NOTED :], done]
         if self.done is None or self.done.incarnation <= done.incarnation:
@@ -64,7 +64,7 @@ S = TypeVar("S")
 
 
 class Awaited(Generic[S]):
-    """Tests whether any of many is awaited, the last awaited one first."""
+    """Test whether any of many is awaited, the last awaited one first."""
 
     def __init__(self) -> None:
         self._left: list[S] = []
@@ -85,8 +85,7 @@ class TeamAttendance:
 
     has_received: whether all messages announced in a `Done` are processed. processed: number of
     processed submaps of a stream. now_ns: the newest team time. world_end: the world's last
-    counters. ends: the announced ends, with their unconfirmed streams. ordered: an operator has
-    ordered the live team to end.
+    counters. ends: the announced ends. ordered: an operator has ordered the live team to end.
     """
 
     names: InitVar[Sequence[str]]
@@ -111,19 +110,19 @@ class TeamAttendance:
         self.robots = {robot: Attendance() for robot in sorted(names)}
 
     def admit(self, robot: str) -> None:
-        """Add a robot to the team."""
+        """Add a robot."""
         self.robots = dict(sorted({**self.robots, robot: Attendance()}.items()))
         self._changed.add(robot)
 
     def forget_members(self) -> None:
-        """Forget `Done` and `GivenUp`, which are filed again."""
+        """Forget `Done` and `GivenUp`, to be filed again."""
         for robot in self.robots.values():
             robot.done, robot.given_up = None, False
             robot.dones.clear()
         self._changed.update(self.robots)
 
     def take(self, message: m.Message) -> None:
-        """Update the attendance from a message of the team."""
+        """Update the attendance from a message."""
         self.note_change(message)
         match message:
             case m.Submap() | m.MapEstimate():
@@ -161,7 +160,7 @@ class TeamAttendance:
             self._changed.add(name)
 
     def note_end(self, end: m.End) -> None:
-        """Keep an announced end, even a refused one: the robots' `Done` may confirm it."""
+        """Store an announced end, even a refused one: the robots' `Done` may confirm it."""
         self.ends.setdefault(end, Awaited())
         if len(self.ends) > MOST_NOTED:
             del self.ends[next(iter(self.ends))]
@@ -217,7 +216,7 @@ class TeamAttendance:
         )
 
     def contradicts(self, end: m.End) -> str | None:
-        """Give the reason why this cannot be the end of the team's streams."""
+        """Return why this cannot be the end of the team's streams."""
         ends = {(s.robot, s.incarnation): s.measurements for s in end.streams}
         silent = sorted(self.robots.keys() - {robot for robot, _ in ends})
         if silent:
@@ -234,9 +233,7 @@ class TeamAttendance:
 
     def is_settled(self, name: str) -> bool:
         """Whether the final map need not wait for this robot: complete, given up, or withdrawn and
-        offline.
-
-        It waits for a lost robot, whose return must not change the map.
+        offline. It waits for a lost robot, whose return must not change the map.
         """
         return self._is_excused(name) or self._never_measured(name) or self.is_complete(name)
 
@@ -246,9 +243,7 @@ class TeamAttendance:
         return [robot for robot, attendance in self.robots.items() if attendance.given_up]
 
     def missing(self) -> list[str]:
-        """List the robots whose streams are not complete or, after an order to end, may
-        have more.
-        """
+        """List the robots with incomplete streams or, after an order to end, perhaps more."""
         return [
             name
             for name, robot in self.robots.items()
@@ -282,8 +277,7 @@ class TeamAttendance:
     def _accept_confirmed_end(self) -> bool:
         """Accept an announced end and the robots' `Done` messages that confirm each other.
 
-        Without keys a stranger can announce a later end and a `Done`; the world and its robots
-        still name the same counters.
+        Without keys a stranger can announce a later end and a `Done`.
         """
         for end, unconfirmed in self.ends.items():
             if not unconfirmed.is_none(end.streams, self._is_open):
@@ -313,10 +307,7 @@ class TeamAttendance:
 
     @property
     def watermark_ns(self) -> float:
-        """The least progress of the live robots: every submap that ends before it has arrived.
-
-        Only robots with a message since the last call are evaluated.
-        """
+        """The least progress of the live robots: every submap that ends before it has arrived."""
         of_all = (self.end, self.withdrawn, self.ordered, self._has_head)
         if of_all != self._of_all:
             self._changed.update(self.robots)
@@ -329,9 +320,7 @@ class TeamAttendance:
         return self._watermark_ns
 
     def _until_ns(self, name: str) -> float:
-        """Progress of one robot if all its submaps until then have arrived; infinite where it is
-        not awaited.
-        """
+        """Progress of a robot if all its submaps until then are here; infinite if not awaited."""
         robot = self.robots[name]
         if robot.lost or self._is_away(robot) or self.is_settled(name):
             return float("inf")

@@ -1,7 +1,6 @@
 """Describe the seams at which the fold cut a stream: its robot was carried off or slipped.
 
-With landmark names the fold makes no cut: the robust loss discounts the submap in which the robot
-was carried off, and the diagnosis (`hypotheses`) names the jump.
+With landmark names the fold makes no cut; the diagnosis (`hypotheses`) names the jump.
 """
 
 import math
@@ -31,9 +30,8 @@ OTHER_START = "; two initial poses contradict each other, so {other}'s may be th
 
 def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:
     """Describe the cuts of a fold, with the motion in the map's frame (x [m], y [m], turn [rad])
-    where both parts are in one island.
-
-    A part that lies where the odometry puts it was not carried off.
+    where both parts are in one island. A part that lies where the odometry puts it was not carried
+    off.
     """
     for cut in fold.cuts:
         later = part_of(cut.stream, cut.after)

@@ -29,10 +29,9 @@ class Checkpoint:
 
 
 class Checkpoints:
-    """A stack of checkpoints by tick; a late input pops those that lack it."""
+    """A stack of checkpoints by tick; empty: the fold before all, which may have cuts."""
 
     def __init__(self, empty: Fold = EMPTY_FOLD) -> None:
-        """Begin with a fold without submaps, which may have cuts."""
         self.kept: tuple[Checkpoint, ...] = ()
         self._empty = empty
 
@@ -84,11 +83,7 @@ def _compacted(checkpoint: Checkpoint) -> Checkpoint:
 
 
 def thinned(kept: tuple[Checkpoint, ...]) -> tuple[Checkpoint, ...]:
-    """Select the checkpoints to keep: two to four of those that are n to 2n ticks old.
-
-    A late submap is folded from a checkpoint at most twice as old as itself; there are about
-    twenty.
-    """
+    """Select two to four of the checkpoints that are n to 2n ticks old: about twenty."""
     last = kept[-1].number
     return tuple(each for each in kept if each.number % _spacing(last - each.number) == 0)
 

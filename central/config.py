@@ -36,7 +36,7 @@ class CommonBiasSigmas(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class SurveyedLandmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A landmark ~ N((x, y), P) in the team's frame [m].
 
-    landmark: its number. sigma_m: of each coordinate. covariance: xx, xy, yy of P [m²] instead.
+    sigma_m: of each coordinate. covariance: xx, xy, yy of P [m²] instead.
     """
 
     landmark: Annotated[int, Meta(ge=0, lt=UNNAMED)]
@@ -59,11 +59,7 @@ class SurveyedLandmark(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CentralConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The fusion rule and its parameters; docs/scenario.md describes every field.
-
-    `teamslam.team.pairs` lists the inputs of each rule. Rules with feedback but
-    `covariance-intersection` count measurements more than once in the robots' covariance.
-    """
+    """The fusion rule and its parameters; docs/scenario.md describes every field."""
 
     fusion: FusionRule = "join"
     tick_s: Positive = 10.0

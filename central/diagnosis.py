@@ -1,9 +1,8 @@
-"""The causes of a map's misfit, the best one first, with remedies.
+"""The causes of a map's misfit, with remedies: a function of the fold and the withdrawn robots'
+submaps.
 
-A pure function of the fold and the withdrawn robots' submaps. Landmarks with two places and jumps
-are hypotheses (`map_joining.hypotheses`), shared errors of a robot's submaps states of the map. A
-mirrored robot's submaps fit the map by a reflection. The covariance scale is judged beside all
-accepted causes.
+Landmarks with two places and jumps are hypotheses (`map_joining.hypotheses`), shared errors of a
+robot's submaps states of the map. The covariance scale is judged beside all accepted causes.
 """
 
 import math
@@ -189,9 +188,8 @@ def _shared_errors(
     """Find errors that differ from the robot's configuration beyond doubt.
 
     Their standard deviation is the larger of the stated one, times the root of a covariance scale
-    above 1, and that from the scatter of the submaps, which slowly changing errors show. Of the
-    scatter an error must exceed more than chance does once in a thousand (Student's t). A large
-    error's standard deviation grows by the error of its sensitivities.
+    above 1, and that from the scatter of the submaps (Student's t), which slowly changing errors
+    show. A large error's standard deviation grows by the error of its sensitivities.
     """
     for found in biases:
         (robot, _), bias, value, stated = found
@@ -330,7 +328,6 @@ def _noise(robot: str, value: float, log_sigma: float) -> m.Diagnosis:
 
 
 def _remedy_of_scale(robot: str, value: float) -> str:
-    """Describe the remedy: other data, other sigmas; none for a saved map."""
     if robot.startswith(MAP):
         if value < 1.0:
             return "leave out days that the saved map contains already: each counts once"

@@ -1,8 +1,7 @@
 """The inputs of a fold: submaps in canonical order, initial poses and verdicts.
 
-They only grow, except for verdicts, and depend on no fold: a fold without some robots reads the
-same inputs. A contribution is several times as large as its message, so it is decoded on demand and
-cached while some fold has it.
+They only grow, except for verdicts, and serve several folds. A contribution is several times as
+large as its message, so it is decoded on demand and cached while some fold has it.
 """
 
 import math
@@ -142,7 +141,7 @@ class FoldInputs:
     def keys(
         self, after: float, last: float = math.inf, without: Collection[str] = ()
     ) -> list[Key]:
-        """List the submaps in the ticks (after, last] without some robots, in canonical order."""
+        """List the submaps in the ticks (after, last] without some robots."""
         begin, end = (
             len(self._order)
             if tick == math.inf
@@ -152,13 +151,11 @@ class FoldInputs:
         return [key for key in self._order[begin:end] if key[1] not in without]
 
     def ticks_after(self, after: float, without: Collection[str]) -> list[int]:
-        """List the ticks after this one with a submap of any other robot, ascending."""
+        """List the later ticks with a submap of any other robot."""
         return list(dict.fromkeys(map(self._tick_of, self.keys(after, without=without))))
 
     def first_tick_of(self, robot: str) -> float:
-        """Return the first tick with a submap or an inter-robot measurement of a robot, else
-        infinity.
-        """
+        """Return the first tick with a submap or a measurement of a robot, else infinity."""
         for key in self._order:
             if key[1] == robot or any(
                 each.teammate == robot for each in self._filed[key].sightings
@@ -167,8 +164,8 @@ class FoldInputs:
         return math.inf
 
     def contribution(self, key: Key) -> Contribution:
-        """Decode a submap, its covariance raised to the least; that of a saved map without the
-        factor on the covariances of submaps, which it contains.
+        """Decode a submap, its covariance raised to the least. That of a saved map contains the
+        factor on the covariances of submaps already.
         """
         found = self._made.get(key)
         if found is None:
@@ -207,7 +204,7 @@ class FoldInputs:
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
         """Return the members of a tick without some robots' submaps and measurements of these;
-        refuse those beyond the bounds.
+        those beyond the bounds are refused.
         """
         order = self.keys(tick - 1, tick, without)
         submaps = [self.contribution(key) for key in order]

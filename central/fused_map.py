@@ -29,11 +29,7 @@ def fused_message(
     cost: tuple[float, int] = (0.0, 0),
     reasons: tuple[str, ...] = (),
 ) -> m.FusedMap:
-    """Make the message of a map with its members; without `joint`, with one covariance per
-    landmark.
-
-    exchange: the lockstep round, if any. cost: (χ², dof). Unreceivable landmarks are left out.
-    """
+    """Make the message of a map; exchange: the lockstep round. cost: (χ², dof)."""
     joint = joint and len(value.ids) <= JOINT_LANDMARKS
     fused = m.FusedMap(
         stamp_ns=stamp_ns,
@@ -57,7 +53,7 @@ def fused_message(
 
 
 def version_entry(stream: tuple[str, int], sequence: int) -> m.VersionEntry:
-    """Make the entry for all submaps of (robot, incarnation) up to `sequence`."""
+    """Make the entry for all submaps of a stream up to `sequence`."""
     robot, incarnation = stream
     return m.VersionEntry(robot=robot, incarnation=incarnation, sequence=sequence)
 

@@ -61,7 +61,7 @@ NONE_SHARED = f"not joined: {SharedPoints(0)}, "
 def encoded_landmarks(
     fold: Fold, shown: Sequence[int], *, joint: bool
 ) -> tuple[bytes, bytes, bytes]:
-    """Encode ids, means and covariance (joint, or by landmark) of the landmarks `shown`."""
+    """Encode ids, means and covariance of landmarks."""
     if not fold.contributions:
         return b"", b"", b""
     if joint:
@@ -89,9 +89,8 @@ class Shown(NamedTuple):
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
-    """Select the landmarks of the map.
-
-    The final map has unnamed ones only if well placed, found again and known to be different.
+    """Select the landmarks of the map: in the final one unnamed ones only if well placed, found
+    again and known to be different.
     """
     if not fold.contributions:
         return Shown()
@@ -125,7 +124,7 @@ def reasons(
     *,
     is_explained: bool = False,
 ) -> tuple[str, ...]:
-    """List why robots and landmarks are not in the map, and warnings about it.
+    """List why robots and landmarks are not in the map, and warnings.
 
     is_explained: the diagnosis names a cause of the misfit.
     """
@@ -208,9 +207,7 @@ def priors(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: Collection[Stream]
 ) -> list[Outgoing]:
     """Make the priors of these streams: in the team's map their estimate, else a message that
-    withdraws earlier priors.
-
-    The final map withdraws those of the robots named.
+    withdraws earlier priors, as all of a final map do.
     """
     given = [] if fused.final else [s for s in sorted(requested) if in_main_island(fold, s)]
     parts = [fold.latest_part(stream) for stream in given]
@@ -233,9 +230,7 @@ def priors(
 def gets_landmarks_alone(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, stream: Stream
 ) -> bool:
-    """Whether a stream outside the team's map, neither withdrawn nor cut, gets a running map's
-    landmarks.
-    """
+    """Whether a stream outside the team's map gets a running map's landmarks."""
     if fused.final or stream[0] in fused.withdrawn or in_main_island(fold, stream):
         return False
     named_ones = sum(id_ < UNNAMED for id_ in shown)
@@ -277,10 +272,8 @@ def trajectories(
 
 
 def _apart(fold: Fold) -> Iterator[str]:
-    """Give, for each island beside the team's map, the reason why its robots are not joined.
-
-    Without landmark names it is the test that the island's best attempt failed, among existing
-    islands.
+    """Give the reason why an island's robots are not joined: without landmark names the test that
+    its best attempt failed.
     """
     frames = {min(fold.islands[key].graph.streams): key for key in fold.islands}
     for frame in sorted(frames):

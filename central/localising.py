@@ -1,8 +1,7 @@
 """Localise robots in a saved map, which stays unchanged (`localise`).
 
 The robots' submaps are their marginals without landmarks that the saved map lacks. Robots have no
-start: the frame is the map's. The published map is the saved one; priors and paths are those of the
-joint solution.
+start: the frame is the map's. Priors and paths are those of the joint solution.
 """
 
 from collections.abc import Iterable
@@ -64,8 +63,8 @@ def in_saved_map(fold: Fold) -> Fold:
 
 
 def seeks_saved_map(fold: Fold, stream: Stream) -> bool:
-    """Return whether a robot is to be placed by a saved map's landmarks: no robot of the main
-    island has a start or is in a saved map, and this one is outside it or alone in it.
+    """Whether a robot is to be placed by a saved map's landmarks: no robot of the main island has a
+    start or is in a saved map, and this one is outside it or alone in it.
     """
     there = [each for each, key in fold.home.items() if key == fold.main_key]
     if any(each in fold.starts or is_map(each) for each in there):

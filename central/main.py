@@ -23,7 +23,7 @@ _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTI
 
 
 class StoredSet(SetFile):
-    """A centre's set on disk, from which a restarted centre continues with the same map."""
+    """A centre's set on disk, from which a restarted centre continues."""
 
     def __init__(self, path: Path | None) -> None:
         super().__init__(path)
@@ -57,10 +57,10 @@ _LOG = logging.getLogger("teamslam")
 
 
 class CentralShell:
-    """The centre's process: it subscribes, answers requests for its set, runs, and leaves last.
+    """The centre's process.
 
     patience_s: a robot lost for this long is given up; None: only by an order. admit: accept robots
-    that the scenario does not name. store: file of the set. maps: saved maps.
+    that the scenario does not name.
     """
 
     def __init__(
@@ -175,7 +175,6 @@ class CentralShell:
             self._shell.take([self._shell.sample_of(order)])
 
     def _awaited(self) -> tuple[str, ...]:
-        """The members missing in the set's file, and the awaited absent robots."""
         now = time.monotonic()
         warnings = [*self._stored.warnings]
         for robot in self.node.awaited:
@@ -193,9 +192,8 @@ class CentralShell:
         return tuple(warnings)
 
     def _request_orders(self) -> None:
-        """Query the router for the operator's orders at intervals.
-
-        The operator's command exits at once, perhaps while this process is offline.
+        """Query the router for the operator's orders: the command exits at once, perhaps while this
+        process is offline.
         """
         now = time.monotonic()
         if now >= self._orders_due:
@@ -203,10 +201,7 @@ class CentralShell:
             self._bus.request(ch.KEPT, "", _ORDERS)
 
     def _gather(self) -> None:
-        """Request submaps that the centre lacks; of robots that appear, all of them.
-
-        Those that a resumed robot took over are in no publisher's cache.
-        """
+        """Request submaps that the centre lacks; of robots that appear, all of them."""
         robots = {n.removeprefix("robot/") for n in self._alive if n.startswith("robot/")}
         for robot in sorted(robots.intersection(self.node.robots) - self._greeted):
             self._bus.request(ch.SENT, robot, m.SubmapsRequest(stamp_ns=0, robot=robot))

@@ -1,7 +1,7 @@
 """Decide when the centre publishes a map, and announce withdrawn robots.
 
-Submaps are folded by ticks of team time, maps published by broadcasts. A running map is *closed*
-where every submap up to its time has arrived, else *provisional*; the *final* one comes at the end.
+A running map is *closed* where every submap up to its time has arrived, else *provisional*; the
+*final* one comes at the end.
 """
 
 import math
@@ -22,10 +22,7 @@ robot.
 
 
 class MapPublisher:
-    """Folds the closed ticks and publishes the maps that are due.
-
-    warnings: failures, refusals and withdrawals in words, the newest last.
-    """
+    """Fold the closed ticks and publish the maps that are due; warnings: the newest last."""
 
     def __init__(self, fold: SubmapFold) -> None:
         self.fold = fold
@@ -50,9 +47,7 @@ class MapPublisher:
 
     def publish_due(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
         """Fold the closed ticks; publish a map if one is due, or if a robot has begun at an unknown
-        pose, which needs its landmarks.
-
-        closed_ns: every submap until then has arrived.
+        pose, which needs its landmarks. closed_ns: every submap until then has arrived.
         """
         self.fold.fold_until(closed_ns)
         withdrawals = self._announce_withdrawals(now_ns)
@@ -69,9 +64,7 @@ class MapPublisher:
         return []
 
     def publish_newest(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish a map of the whole set, if the last one lacks a submap; provisional if ahead of
-        the watermark.
-        """
+        """Publish a map of the whole set, if the last one lacks a submap."""
         if not self._has_news(math.inf):
             return []
         self.fold.fold_until(closed_ns)
@@ -144,10 +137,7 @@ class MapPublisher:
     # Withdrawals.
 
     def withdraw(self, order: m.Withdrawal) -> bool:
-        """Withdraw a robot by an order; return whether this is new.
-
-        Its submaps stay stored for requests.
-        """
+        """Withdraw a robot by an order; return whether this is new."""
         is_new = order.robot not in self.withdrawn
         self.store.add(order)
         if is_new:
@@ -155,7 +145,7 @@ class MapPublisher:
         return is_new
 
     def _announce_withdrawals(self, now_ns: int) -> list[Outgoing]:
-        """Publish the fold's withdrawals since the last call; late submaps may revoke one."""
+        """Publish the fold's new withdrawals; late submaps may revoke one."""
         found = self.fold.convicted
         for robot in sorted(self._announced.keys() - found.keys()):
             del self._announced[robot]

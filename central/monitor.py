@@ -2,9 +2,8 @@
 
 Two figures are 1 where every covariance is right. The joint cost per degree of freedom is sharp
 (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but bounded by a robust loss.
-The covariance scale (docs/decisions/22) is unbounded, insensitive to a minority of outliers, and
-also shows too large covariances; out of bounds is one that chance alone reaches less than once in a
-thousand. `teamslam.central.diagnosis` reports it.
+The covariance scale (docs/decisions/22) is unbounded and insensitive to a minority of outliers; out
+of bounds is one that chance alone reaches less than once in a thousand.
 """
 
 import math
@@ -62,7 +61,7 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     """Describe where the team's data contradict the models of all robots.
 
     Where odometry and ranges contradict each other about the size of a map, the robots' range
-    scales move in one direction: their mean shows it, the joint cost hardly.
+    scales move in one direction.
     """
     ranges = _mean_of(biases, "range_scale")
     if ranges is None:

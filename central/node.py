@@ -38,8 +38,7 @@ class CentralNode:
     """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
     inputs: the channels of the set. announcement: the configuration, whose digest maps carry.
-    admit: a robot that the scenario does not name joins when it, or its driver, appears. warnings:
-    failures in words, the newest last.
+    admit: accept robots that the scenario does not name. warnings: the newest last.
     """
 
     inputs: ClassVar[tuple[ch.Channel, ...]] = (
@@ -79,7 +78,7 @@ class CentralNode:
         self.final: m.FusedMap | None = None
 
     def restart(self) -> None:
-        """Begin with an empty set, to be filed again; the attendance stays."""
+        """Begin with an empty set; the attendance stays."""
         self._begin_set()
         self.attendance.forget_members()
 
@@ -96,7 +95,7 @@ class CentralNode:
         self._loaded = tuple(maps)
 
     def begin(self) -> list[Outgoing]:
-        """Make the first messages: the configuration and saved maps."""
+        """Make the first messages: configuration and saved maps."""
         for saved in self._loaded:
             self.file(saved)
         maps = [Outgoing(ch.SAVED_MAP, saved.author, saved) for saved in self._loaded]
@@ -105,7 +104,7 @@ class CentralNode:
     # Receive.
 
     def refusal(self, message: m.Message) -> str | None:
-        """Give the reason why a message cannot be true of this team."""
+        """Return the reason why a message cannot be true of this team."""
         self._admit(message)
         refused = self._door.refusal(message)
         if refused is None and isinstance(message, m.End):
@@ -143,8 +142,8 @@ class CentralNode:
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue after an exception in `handle`, and give the sender the credit.
 
-        A member that could not be filed counts as refused. The newest computable map replaces a
-        final one that raises, provisional and with the reason.
+        A member that could not be filed counts as refused. The newest map replaces a final one that
+        raises, provisional and with the reason.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)
@@ -162,7 +161,7 @@ class CentralNode:
     # File.
 
     def file(self, message: m.Message) -> list[Outgoing]:
-        """File a member of the set; return its sender's credit, or the order to repeat."""
+        """File a member; return its sender's credit, or the order to repeat."""
         match message:
             case m.Submap():
                 return self._file_submap(message)
@@ -187,7 +186,6 @@ class CentralNode:
         return self._credit_of(sighting, count) if count > before else []
 
     def _refuse(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Mark a submap as refused where it, or a measurement from it, raised."""
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
         self.store.refuse(message)
@@ -210,10 +208,7 @@ class CentralNode:
         return [Outgoing(ch.CENTRAL_PROGRESS, member.robot, progress)]
 
     def _follow(self, order: m.Withdrawal) -> list[Outgoing]:
-        """Follow an order, and repeat it for later robots: the operator's command has exited.
-
-        The fold finds an order of this centre's earlier process again.
-        """
+        """Follow an order, and repeat it for later robots: the operator's command has exited."""
         if order.by == "central" or not self.maps.withdraw(order):
             return []
         return [Outgoing(ch.WITHDRAWAL, order.robot, order)]
@@ -228,7 +223,7 @@ class CentralNode:
         return out + self._conclude() if self._is_over else out
 
     def publish_due(self) -> list[Outgoing]:
-        """Fold the ticks closed by the live robots' least progress; make the due maps."""
+        """Fold the closed ticks; make the due maps."""
         return self.maps.publish_due(self.attendance.watermark_ns, self.attendance.now_ns)
 
     def publish_newest(self) -> list[Outgoing]:
@@ -246,7 +241,7 @@ class CentralNode:
         return out
 
     def refresh(self) -> list[Outgoing]:
-        """Make a map of the whole set when there is time, unless the last one has it."""
+        """Make a map of the whole set when there is time."""
         return [] if self.finished else self._counted(self.publish_newest())
 
     # Conclude.
@@ -313,7 +308,7 @@ class CentralNode:
         return []
 
     def lacking(self) -> list[m.SubmapsRequest]:
-        """Request the submaps announced by robots that no map can have."""
+        """Request the submaps that robots have announced and no map can have."""
         if self.finished:
             return []
         sent: dict[Stream, int] = {}
@@ -336,8 +331,9 @@ class CentralNode:
         return [encoded(message) for message in self.store.messages_of(robot)]
 
     def answer_site(self, request: bytes) -> Iterable[bytes]:
-        """Answer a `FoldRequest` with a saved map of the present set, folded anew and solved in
-        full. Raises NothingToSaveError.
+        """Answer a `FoldRequest` with a saved map of the present set, solved in full.
+
+        Raises NothingToSaveError.
         """
         decoded(request, m.FoldRequest)
         fold = self.maps.fold

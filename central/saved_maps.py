@@ -51,9 +51,9 @@ def save_map(
     firsts: Collection[bytes],
     datum: Datum | None = None,
 ) -> m.SavedMap:
-    """Make a saved map of a fold's final map; before: the stored maps of earlier days, by author.
-    firsts: digest of the first submap of each robot's stream, which reveals maps with measurements
-    in common. datum: of the map's frame.
+    """Make a saved map of a fold's final map; before: those of earlier days, by author. firsts:
+    digest of the first submap of each robot's stream, which reveals maps with measurements in
+    common.
 
     With the biases c that all sensors share, landmarks and errors of single robots, y = (o, x), are
     N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. The map also has the likelihood
@@ -129,10 +129,7 @@ def _classes(fold: Fold, unnamed: Sequence[int]) -> bytes:
 
 
 def _own_errors(island: Island) -> dict[RobotBias, int]:
-    """Return the nodes of the lasting errors of today's robots, each of the last stream.
-
-    Those of robots of earlier days stay part of the landmarks' covariance.
-    """
+    """Return the nodes of the lasting errors of today's robots, each of the last stream."""
     found: dict[RobotBias, int] = {}
     for (stream, bias), node in sorted(
         island.graph.biases.items(), key=lambda each: (whole_of(each[0][0]), each[0])
@@ -147,9 +144,9 @@ def _evidence(
 ) -> tuple[Float[np.ndarray, " E"], Float[np.ndarray, "E E"]]:
     """Compute the likelihood N(mean, J⁻¹) of some biases by the island's measurements: (mean, J).
 
-    J = Σ⁻¹ − D with their posterior covariance Σ and the information D of their priors about 0. The
-    error of an earlier day that a bias drifted from is eliminated without its prior. A part
-    REMAINDER of D stays, so that J is positive definite.
+    J = Σ⁻¹ − D with their posterior covariance Σ and the information D of their priors about 0, of
+    which a part REMAINDER stays. The error of an earlier day that a bias drifted from is eliminated
+    without its prior.
     """
     if not nodes:
         return np.zeros(0), np.zeros((0, 0))
@@ -200,9 +197,8 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     """List the state of each landmark against the saved maps in the main island, by number.
 
     Of several maps the one with the largest change counts. A landmark that one submap places
-    elsewhere, while none sees it at its former place, is gone: a single wrong number does not move
-    it. An unnamed one has moved if its former place is empty; else the other place is a new
-    landmark's.
+    elsewhere, while none sees it at its former place, is gone. An unnamed one has moved if its
+    former place is empty; else the other place is a new landmark's.
     """
     if fold.main_key is None:
         return ()

@@ -1,8 +1,8 @@
 """Select the robots that need a prior, since it has news from teammates (moved landmarks,
 inter-robot measurements) or landmarks nearby.
 
-Priors are most of the centre's traffic. A robot outside the team's map gets the landmarks alone, as
-if at the origin, or one message that withdraws its earlier priors, also from a restarted centre.
+A robot outside the team's map gets the landmarks alone, as if at the origin, or one message that
+withdraws its earlier priors, also from a restarted centre.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -36,10 +36,10 @@ NEVER = -1
 
 @dataclass(frozen=True)
 class _Sent:
-    """The map of a robot's last prior and the landmarks in it.
+    """A robot's last prior, and the map that it was made of.
 
     encounter_ns: of the newest inter-robot measurement of or by the robot. since: number of later
-    broadcasts. frame: the team's, then. alone: without a pose.
+    broadcasts. alone: without a pose.
     """
 
     blocks: LandmarkBlocks
@@ -70,7 +70,7 @@ class SentPriors:
         shown: Sequence[int],
         alone: Collection[Stream] = (),
     ) -> list[Stream]:
-        """Select the streams to which to send a prior of this fold with these landmarks.
+        """Select the streams to which to send a prior of this fold.
 
         alone: those that get landmarks alone. Others outside the team's map are selected once, to
         withdraw theirs.
@@ -115,9 +115,7 @@ class SentPriors:
         encounter_ns: int = NEVER,
         frame: Stream | None = None,
     ) -> bool:
-        """Whether to send a prior at this pose (None: of landmarks alone); if so, note
-        it as sent.
-        """
+        """Whether to send a prior at this pose (None: of landmarks alone); if so, note it."""
         offsets = blocks.means if pose is None else blocks.means - pose[:2]
         nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
         old = self._sent.get(stream)

@@ -1,6 +1,6 @@
 """The fold of the stored set, and the messages of a map: the map itself, priors and paths.
 
-The map is a pure function of the set (law 2). Centre, peers and verification run this class.
+The map is a pure function of the set (law 2).
 """
 
 import math
@@ -59,10 +59,10 @@ class RecordedFields(NamedTuple):
 
 
 class SubmapFold:
-    """Folds the stored set tick by tick and makes the messages of its maps.
+    """Fold the stored set tick by tick and make the messages of its maps.
 
-    warnings: failures in words, the newest last. landmarks, finding, diagnosis, reasons: of the
-    newest map. not_folded: number of refused inputs.
+    convicts: False for a recorded set, which withdraws no further robot. warnings: the newest last.
+    landmarks, finding, diagnosis, reasons: of the newest map. not_folded: number of refused inputs.
     """
 
     def __init__(
@@ -73,7 +73,6 @@ class SubmapFold:
         *,
         convicts: bool = True,
     ) -> None:
-        """Fold a store. convicts: False for a recorded set, which withdraws no further robot."""
         self.config = config
         self.config_digest = digest
         self.store = SubmapStore() if store is None else store
@@ -140,10 +139,7 @@ class SubmapFold:
         return save_map(fold, fused, name, before, self._first_submaps(fold), datum)
 
     def _first_submaps(self, fold: Fold) -> list[bytes]:
-        """Digests of the first submaps of the robots' streams in the team's map.
-
-        Two maps share a measurement only if they share a stream.
-        """
+        """Digests of the first submaps of the robots' streams in the team's map."""
         main = [stream for stream, key in fold.home.items() if key == fold.main_key]
         streams = {whole_of(stream) for stream in main if not is_map(stream)}
         if not streams:

@@ -1,5 +1,4 @@
-"""Surveyed landmarks as a member of the set: a saved map
-(`teamslam.team.estimation.map_joining.saved_maps`) whose start is exactly known.
+"""Surveyed landmarks as a saved map whose start is exactly known.
 
 Landmark i ~ N(surveyed place, P_i) in the team's frame, independent of the others. The survey
 places streams without an initial pose; a contradictory landmark is separated from it.
@@ -60,9 +59,8 @@ def station() -> tuple[Submap, InitialPoseFactor]:
 
 def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -> Datum | None:
     """Return the datum of a map's frame: the configuration's, else that of a loaded map in the
-    survey's frame.
-
-    None where a landmark is farther than FARTHEST_M, as with coordinates of a national grid.
+    survey's frame. None where a landmark is farther than FARTHEST_M, as with coordinates of a
+    national grid.
     """
     places = floats(fused.means, "means")
     if fused.frame != SURVEY_FRAME or np.abs(places).max(initial=0.0) > FARTHEST_M:

@@ -10,16 +10,13 @@ tick has arrived, so the fold is final.
 
 A tick pushes a checkpoint; a late submap, a verdict or a withdrawal rolls back, and the ticks are
 folded again. A change of the conviction, the robots that contradict the rest beyond chance
-(`teamslam.central.withdrawal`), folds all ticks again without these. Agreement is tested after the
-first tick of each broadcast's time and after the full solution, so a withdrawal depends on the set
-alone.
-
-Running maps leave out (suspend) a robot with few submaps, until it has enough to be withdrawn; all
-its submaps are tested whenever the set has grown by GROWTH. A provisional map is tested by itself.
+(`teamslam.central.withdrawal`), folds all ticks again. Agreement is tested after the first tick of
+each broadcast's time and after the full solution, so a withdrawal depends on the set alone. Running
+maps leave out (suspend) a robot with few submaps, until it has enough to be withdrawn.
 
 Old submaps are condensed before each tick (`condensing`), and restored by a tick that contradicts
-them (`relinearising`) and by the full solution. Without landmark names the full solution folds the
-ticks again with nothing condensed (but see FULL_UNNAMED).
+them (`relinearising`) and by the full solution, which without landmark names folds the ticks again
+with nothing condensed (but see FULL_UNNAMED).
 """
 
 import math
@@ -100,8 +97,7 @@ class TickFold:
     """Folds a set of submaps tick by tick.
 
     limits: sizes for condensing; None: never. inputs: those of another fold, read only. convicts:
-    whether the fold withdraws robots by itself. undecided: contradictory robots with the wrong one
-    undetermined.
+    whether the fold withdraws robots. undecided: robots that contradict each other.
     """
 
     def __init__(
@@ -142,10 +138,7 @@ class TickFold:
         sightings: Sequence[SightingFactor] = (),
         own: OwnBiases = NO_OWN,
     ) -> None:
-        """Add a submap with the inter-robot measurements from it; roll back to before its tick.
-
-        own: the errors of single robots in a saved map.
-        """
+        """Add a submap with the inter-robot measurements from it; roll back to before its tick."""
         tick = self._inputs.add_submap(submap, digest, sightings, own)
         if submap.robot not in self._gone or tick <= self._conviction.at:
             self.roll_back(tick)
@@ -153,15 +146,14 @@ class TickFold:
             self._roll_back_others(tick)
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> None:
-        """Replace an operator's verdicts; refold from the first tick that judges a changed one."""
+        """Replace an operator's verdicts; fold the changed ticks again."""
         tick = self._inputs.set_verdicts(verdicts)
         if math.isfinite(tick):
             self._fold_again(tick)
 
     def withdraw_robot(self, robot: str) -> None:
-        """Leave out a robot's submaps, and inter-robot measurements by or of it, now and in future.
-
-        The result is that of a team without the robot.
+        """Leave out a robot's submaps and the measurements of it, now and in future, as of a team
+        without the robot.
         """
         if robot not in self._ordered:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
@@ -174,10 +166,7 @@ class TickFold:
         self.fold_until(until_ns)
 
     def roll_back(self, tick: float) -> None:
-        """Drop the ticks from this one on; all of them if a conviction is based on one.
-
-        No checkpoint contains a convicted robot.
-        """
+        """Drop the ticks from this one on; all of them if a conviction is based on one."""
         if tick <= self._conviction.at:
             self._restart(Conviction())
         self.checkpoints.roll_back(tick)
@@ -218,10 +207,7 @@ class TickFold:
         return (self.checkpoints.tick + 1) * self._inputs.tick_ns
 
     def fold_until(self, watermark_ns: float) -> bool:
-        """Fold every tick up to the watermark; return whether there was one.
-
-        A conviction restarts the fold.
-        """
+        """Fold every tick up to the watermark; return whether there was one."""
         folded = False
         while ticks := self._open_ticks(watermark_ns):
             folded = True
@@ -290,11 +276,9 @@ class TickFold:
         return len(self._inputs.keys(-math.inf, tick, gone))
 
     def _convict(self, fold: Fold, at: float) -> bool:
-        """Withdraw or suspend the robot that a trial of the fold finds; return whether there is
-        one.
+        """Withdraw or suspend the robot that a trial finds; return whether there is one.
 
-        at: the tick; infinity for the full solution, which suspends no robot. Its warning is part
-        of every final map.
+        at: the tick; infinity for the full solution, which suspends no robot.
         """
         self.undecided = ""
         if not self._tries and math.isfinite(at):
@@ -341,10 +325,7 @@ class TickFold:
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
-        """Fold the same inputs up to a time without some robots; withdraw no other.
-
-        The fold is kept until no robot is suspected.
-        """
+        """Fold the same inputs without some robots; kept until no robot is suspected."""
         gone = self._gone.union(robots)
         other = self._others.get(gone)
         if other is None:
@@ -369,11 +350,10 @@ class TickFold:
         return other
 
     def fold_apart(self, fold: Fold, *, ahead: bool) -> Mapping[str, Fold]:
-        """Fold each robot's submaps by themselves where joining them contradicts.
+        """Fold each robot's submaps by themselves where joining them contradicts: where a robot's
+        disagreement exceeds the limit, and as many times its disagreement alone.
 
-        It does where a robot's disagreement with the team exceeds the limit, and as many times its
-        disagreement alone. A fold in another frame than the team's is empty. ahead: with the ticks
-        that are not closed.
+        A fold in another frame than the team's is empty. ahead: with the ticks that are not closed.
         """
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
@@ -410,7 +390,7 @@ class TickFold:
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
         """Find the robot that contradicts the rest in a provisional fold, with the reason.
 
-        Closed ticks have their own test. A trial's result holds until the set has grown by GROWTH.
+        A trial's result holds until the set has grown by GROWTH.
         """
         if provisional is self.fold or not self.convicts:
             return {}
@@ -423,10 +403,7 @@ class TickFold:
         return {robot: why for robot, why in self._accused.items() if robot not in self._gone}
 
     def solve(self) -> Fold:
-        """Solve for all inputs in full, without the robots that are then withdrawn.
-
-        Suspended robots are tested one after the other.
-        """
+        """Solve for all inputs in full, without the robots that are then withdrawn."""
         while True:
             self.fold_until(math.inf)
             if self.suspended:
@@ -483,7 +460,7 @@ class TickFold:
         return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
-        """Return the last sequence of each stream, folded or refused, but for the survey's."""
+        """Return the last sequence of each stream, folded or refused."""
         last: dict[Stream, int] = {}
         parts = [(stream, fold.next_sequence(stream) - 1) for stream in fold.home]
         parts += [(key[1:3], key[3]) for key in fold.refused]

@@ -28,10 +28,7 @@ SHOWN = 1 + LAST
 
 
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
-    """Tabulate the unnamed landmarks: member, identity, step.
-
-    every: all members, else the first and last.
-    """
+    """Tabulate the unnamed landmarks; every: all members, else the first and last."""
     entries = sorted(_all_members(landmarks) if every else _summarised_members(landmarks))
     table = []
     for (robot, incarnation), group in groupby(entries, key=lambda entry: entry[0][:2]):

@@ -3,13 +3,13 @@
 A robot's disagreement is the largest of three figures, near or below 1 where its covariances are
 right: its share of the joint cost per degree of freedom; the unweighted χ²/dof that most of its
 submaps exceed, the newest if it has few; and that which most of the newest inter-robot measurements
-by or of it exceed. A minority, which the robust loss discounts, is no reason to lose the robot. The
-last figure finds a robot whose odometry reports no motion: its submaps fit the map.
+by or of it exceed, which finds a robot whose odometry reports no motion. A minority, which the
+robust loss discounts, is no reason to lose the robot.
 
-One wrong robot makes others disagree; one with overconfident covariances, or that fixes the frame,
-others only. So each is left out in turn, and withdrawn only if the rest agree without it, and
-without no other. Two robots that contradict each other, and no third, are reported and both stay,
-unless one contradicts itself when alone.
+One with overconfident covariances, or that fixes the frame, makes only others disagree. So each is
+left out in turn, and withdrawn if the rest agree without it, and without no other. Two robots that
+contradict each other, and no third, are reported and both stay, unless one contradicts itself when
+alone.
 """
 
 import math
@@ -49,10 +49,7 @@ Without = Callable[[Collection[str]], Agreement | None]
 
 @dataclass(frozen=True)
 class Trial:
-    """The robot that is wrong beyond chance, or None, with the reason.
-
-    undecided: contradictory robots with the wrong one undetermined.
-    """
+    """The robot that is wrong beyond chance; undecided: robots that contradict each other."""
 
     robot: str | None = None
     reason: str = ""
@@ -61,10 +58,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Suspension:
-    """Why a robot is left out of running maps.
-
-    retried: size of the set at which it is tested again.
-    """
+    """Why a robot is left out of running maps; retried: size of the set at the next test."""
 
     reason: str
     retried: float
@@ -74,8 +68,8 @@ class Suspension:
 class Conviction:
     """The robots that a fold leaves out by itself.
 
-    withdrawn: the reason by robot. suspended: left out until tested again. at: the last tick that
-    this is based on. tested_from: the first tick tested under it.
+    suspended: left out until tested again. at: the last tick that this is based on. tested_from:
+    the first tick tested under it.
     """
 
     withdrawn: Mapping[str, str] = field(default_factory=dict)
@@ -102,9 +96,8 @@ class Conviction:
 def disagreement(
     agreement: Agreement, chance: float = SUSPICION, least: int = FEWEST
 ) -> dict[str, float]:
-    """Return the disagreement of each robot that can be judged.
-
-    chance: costs of a probability above e^−chance do not count. least: fewest submaps.
+    """Return the disagreement of each robot that can be judged; costs of a probability above
+    e^−chance do not count.
     """
     submaps = agreement.submaps
     seen: dict[str, list[tuple[float, float]]] = {}
@@ -124,10 +117,7 @@ def disagreement(
 
 
 def _most(costs: Float[np.ndarray, "2 n"], chance: float, least: int = FEWEST) -> float | None:
-    """χ²/dof that most submaps exceed, at most 1 where chance explains it; None with too few.
-
-    costs: χ² and dof of each, oldest first.
-    """
+    """χ²/dof that most submaps exceed; costs: χ² and dof of each, oldest first."""
     chi2, dof = costs
     if len(dof) >= LEAST_SUBMAPS:
         return float(median((chi2 / dof).tolist()))
@@ -176,10 +166,9 @@ def find_suspects(agreement: Agreement, limit: float) -> list[str]:
 
 
 def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
-    """Find the robot that is wrong beyond chance by leaving out one after the other.
-
-    It is the only one without which the rest agree, at least two of them; or the only one of those
-    that contradicts itself when alone.
+    """Find the robot that is wrong beyond chance by leaving out one after the other: the only one
+    without which the rest agree, at least two of them; or the only one of those that contradicts
+    itself.
     """
     found = disagreement(agreement)
     suspected = find_suspects(agreement, limit)
@@ -215,11 +204,7 @@ def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
 def _contradict_alone(
     robots: Collection[str], team: Collection[str], limit: float, without: Without
 ) -> int:
-    """Count the robots whose submaps disagree when alone, by more than the rest may.
-
-    Of two such robots one is left whoever is left out. Noise that the team states too small shows
-    here.
-    """
+    """Count the robots whose submaps disagree when alone: noise that the team states too small."""
     if len(robots) < 2:
         return 0
     alone = (without({*team} - {robot}) for robot in robots)
@@ -234,7 +219,7 @@ def cost_share(chi2: float, dof: float, chance: float) -> float:
 
 
 def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
-    """Whether one of a robot's submaps, however light, contradicts its others."""
+    """Whether one of a robot's submaps contradicts its others."""
     if alone is None:
         return False
     chi2, dof, *_ = alone.submaps.table.tolist()
