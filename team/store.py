@@ -1,6 +1,6 @@
 """The team's set of submaps: a union, so duplicates and any order of arrival change nothing."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -17,31 +17,37 @@ Stream = tuple[str, int]
 class StoredStream:
     """The members of one incarnation of a robot.
 
-    sightings: inter-robot measurements by sequence, then by (stamp, teammate); a submap with all
-    that it announces is complete. chain: the complete submaps from sequence 0 on, without a gap.
-    used: the (measurement, teammate) pairs in an inter-robot measurement. refused: sequences of
-    refused members.
+    chain: the complete submaps from sequence 0 on, without a gap. pending: the other submaps, by
+    sequence. sightings: inter-robot measurements by sequence, then by (stamp, teammate); with all
+    that it announces a submap is complete. used: the (measurement, teammate) pairs in them.
+    refused: sequences of refused members.
     """
 
     start: m.InitialPose | None = None
-    submaps: dict[int, m.Submap] = field(default_factory=dict)
-    sightings: dict[int, dict[tuple[int, str], m.SightingFactor]] = field(default_factory=dict)
     chain: list[m.Submap] = field(default_factory=list)
+    pending: dict[int, m.Submap] = field(default_factory=dict)
+    sightings: dict[int, dict[tuple[int, str], m.SightingFactor]] = field(default_factory=dict)
     used: set[tuple[int, str]] = field(default_factory=set)
     refused: set[int] = field(default_factory=set)
 
     def extend_chain(self) -> None:
         """Append the submaps that are complete and continue the chain."""
-        while (submap := self.submaps.get(len(self.chain))) is not None:
+        while (submap := self.pending.get(len(self.chain))) is not None:
             if len(self.sightings.get(submap.sequence, ())) < submap.sightings:
                 break
-            self.chain.append(submap)
+            self.chain.append(self.pending.pop(submap.sequence))
+
+    def submap(self, sequence: int) -> m.Submap | None:
+        """Return a stored submap."""
+        if 0 <= sequence < len(self.chain):
+            return self.chain[sequence]
+        return self.pending.get(sequence)
 
     def processed(self, count: int) -> int:
         """Return `count`; if the next submap was refused, all."""
         if count not in self.refused:
             return count
-        return max(*self.refused, *self.submaps, count) + 1
+        return max(*self.refused, *self.pending, len(self.chain) - 1, count) + 1
 
 
 _EMPTY = StoredStream()
@@ -64,7 +70,6 @@ class SubmapStore:
         self.verdicts: set[m.Judgement] = set()
         self.refused = 0
         self._revoked: set[m.Judgement] = set()
-        self._with_gap: set[Stream] = set()
 
     # Admission.
 
@@ -165,32 +170,28 @@ class SubmapStore:
         """Store a submap, or return why not, by the submaps nearest in sequence."""
         key = submap.robot, submap.incarnation
         stream = self._stream(key)
-        submaps = stream.submaps
         name = f"submap {submap.sequence} of {submap.robot}, incarnation {submap.incarnation}"
-        stored = submaps.get(submap.sequence)
+        stored = stream.submap(submap.sequence)
         if stored is not None:
             return None if stored == submap else f"{name} differs from the one in the set"
-        is_next = len(stream.chain) == len(submaps) == submap.sequence
-        nearest = (submap.sequence - 1, None) if is_next else _nearest(submaps, submap.sequence)
-        for sequence in nearest if submaps else ():
-            if sequence is None:
-                continue
-            other = submaps[sequence]
+        last = len(stream.chain) - 1
+        before = max((s for s in stream.pending if s < submap.sequence), default=last)
+        after = min((s for s in stream.pending if s > submap.sequence), default=-1)
+        for other in filter(None, map(stream.submap, (before, after))):
             first, second = sorted((submap, other), key=lambda s: s.sequence)
             if second.first_measurement <= first.last_measurement:
                 return (
                     f"{name} uses measurements "
                     f"{submap.first_measurement}-{submap.last_measurement}, which "
-                    f"overlap submap {sequence}'s "
+                    f"overlap submap {other.sequence}'s "
                     f"{other.first_measurement}-{other.last_measurement}"
                 )
             is_adjacent = second.sequence == first.sequence + 1
             ends, begins = first.last_measurement + 1, second.first_measurement
             continues = (ends, first.stamp_ns) == (begins, second.start_ns)
             if not (continues if is_adjacent else first.stamp_ns <= second.start_ns):
-                return f"{name} does not continue submap {sequence}"
-        submaps[submap.sequence] = submap
-        self._with_gap.add(key)
+                return f"{name} does not continue submap {other.sequence}"
+        stream.pending[submap.sequence] = submap
         return None
 
     def _refusal_of_sighting(self, sighting: m.SightingFactor) -> str | None:
@@ -201,7 +202,7 @@ class SubmapStore:
         stored = from_submap.get((sighting.stamp_ns, teammate))
         if stored is not None:
             return None if stored == sighting else f"{name} differs from the one in the set"
-        submap = stream.submaps.get(sighting.sequence)
+        submap = stream.submap(sighting.sequence)
         if submap is not None and len(from_submap) >= submap.sightings:
             return f"{name} is one more than submap {sighting.sequence} has"
         twice = next((n for n in sighting.measurements if (n, teammate) in stream.used), None)
@@ -265,15 +266,11 @@ class SubmapStore:
 
     def missing(self) -> tuple[m.VersionEntry, ...]:
         """Return the first missing submap of each stream with later ones."""
-        gaps = []
-        for robot, incarnation in sorted(self._with_gap):
-            stream = self.streams[robot, incarnation]
-            first = len(stream.chain)
-            if len(stream.submaps) > first:
-                gaps.append(m.VersionEntry(robot=robot, incarnation=incarnation, sequence=first))
-            else:
-                self._with_gap.discard((robot, incarnation))
-        return tuple(gaps)
+        return tuple(
+            m.VersionEntry(robot=robot, incarnation=incarnation, sequence=len(stream.chain))
+            for (robot, incarnation), stream in sorted(self.streams.items())
+            if stream.pending
+        )
 
     def messages_of(self, robot: str) -> Iterator[m.Message]:
         """Yield a robot's members for its next process, latest incarnation first."""
@@ -284,11 +281,6 @@ class SubmapStore:
                 yield from stream.chain
                 for submap in stream.chain:
                     yield from self.sightings(submap)
-
-
-def _nearest(submaps: Mapping[int, m.Submap], sequence: int) -> tuple[int | None, int | None]:
-    below = max((s for s in submaps if s < sequence), default=None)
-    return below, min((s for s in submaps if s > sequence), default=None)
 
 
 def _in_order(judgement: m.Judgement) -> m.Judgement:

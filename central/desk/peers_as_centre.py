@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import msgspec
 
-from teamslam.central.team_config import team_config
+from teamslam.central.config import team_config
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, try_open

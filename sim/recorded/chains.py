@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import structs
 
+from teamslam.central.config import TeamConfig
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.central.desk.evaluation.results import Evaluation
-from teamslam.central.team_config import TeamConfig
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.gaussian import Matrix

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from teamslam.central.team_config import TeamConfig
+from teamslam.central.config import TeamConfig
 from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, plain_error, types_of
 from teamslam.sim.scenarios.document import (
     MAX_ROBOTS,

@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from teamslam.central.config import TeamConfig, team_config
 from teamslam.central.desk.evaluation.association import association_result
 from teamslam.central.desk.evaluation.clocks import (
     Late,
@@ -35,7 +36,6 @@ from teamslam.central.desk.evaluation.states import robot_states
 from teamslam.central.desk.evaluation.verdicts import verdicts_given
 from teamslam.central.desk.names import data_set_of, in_order
 from teamslam.central.diagnosis import contradicts
-from teamslam.central.team_config import TeamConfig, team_config
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME, UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from teamslam.central.config import TeamConfig
 from teamslam.central.desk.evaluation.association import AssociationResult
 from teamslam.central.desk.evaluation.clocks import Late, clock_cause, is_refuted
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, PoseErrors
@@ -17,7 +18,6 @@ from teamslam.central.desk.evaluation.matching import Gospa, Matching
 from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import contradicts, describe
-from teamslam.central.team_config import TeamConfig
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m

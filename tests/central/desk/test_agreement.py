@@ -4,11 +4,11 @@ import json
 import msgspec
 import pytest
 
+from teamslam.central.config import TeamConfig
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.peers_as_centre import Agreement, PeersAsCentre
 from teamslam.central.desk.view.server import Feed
-from teamslam.central.team_config import TeamConfig
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.config import RobotConfig
 from teamslam.team.recording.recorder import Recorder
