@@ -17,10 +17,9 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import msgspec
-
 from teamslam.sim.scenarios.scenario import Scenario
 from tests import bits
+from tests.scenarios import with_world
 
 CLASSES: Mapping[str, Mapping[str, str]] = {
     "this processor": {},
@@ -45,8 +44,7 @@ CASES = {
 
 
 def begun(scenario: Scenario, seconds: float) -> Scenario:
-    world = msgspec.structs.replace(scenario.world, duration_s=seconds)
-    return msgspec.structs.replace(scenario, world=world)
+    return with_world(scenario, duration_s=seconds)
 
 
 def measured(name: str, path: Path) -> None:

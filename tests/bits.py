@@ -28,6 +28,7 @@ from teamslam.team.pairs import PAIRS
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
+from tests.scenarios import with_world
 from tests.support import ROOT
 
 TABLE = Path(__file__).with_suffix(".json")
@@ -40,9 +41,7 @@ Row = Mapping[str, str]
 
 def world(name: str, seed: int = 1, **changes: object) -> Scenario:
     scenario = with_options(load(name), seed=seed)
-    return msgspec.structs.replace(
-        scenario, world=msgspec.structs.replace(scenario.world, **changes)
-    )
+    return with_world(scenario, **changes)
 
 
 def pair(estimator: str, fusion: str) -> Scenario:

@@ -10,7 +10,6 @@ from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,7 +33,7 @@ from teamslam.team.wire.bus import Outgoing, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import NO_MAP, digest_of
 from tests import build
-from tests.final_maps import final_only
+from tests.scenarios import final_only, with_world
 from tests.support import ROOT, fused_map
 from tests.teams import Team, config, driven, of, published, stream, world_of
 
@@ -92,15 +91,13 @@ def utias(tmp_path_factory):
     """Three robots of a UTIAS data set, with observations between the odometry's stamps."""
     folder = tmp_path_factory.mktemp("utias") / "MRCLAM_Dataset0"
     scenario = load("waypoints")
-    world = msgspec.structs.replace(scenario.world, steps=45)
-    write_utias(streams_of(msgspec.structs.replace(scenario, world=world)), folder)
+    write_utias(streams_of(with_world(scenario, steps=45)), folder)
     return with_options(load("utias"), dataset=folder, robots=3)
 
 
 def thesis(steps=45):
     scenario = load("thesis")
-    world = msgspec.structs.replace(scenario.world, steps=steps)
-    return msgspec.structs.replace(scenario, world=world)
+    return with_world(scenario, steps=steps)
 
 
 def test_a_simulated_teams_measurements_are_each_used_once():

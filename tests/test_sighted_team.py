@@ -1,6 +1,5 @@
 import random
 
-import msgspec
 import pytest
 
 from teamslam.central.config import CentralConfig
@@ -13,28 +12,16 @@ from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import encoded
+from tests.scenarios import with_front_ends, with_robots
 from tests.sim.reruns import messages, team_samples, thesis, written
 from tests.teams import Team, driven, of, published
 
 CENTRE = CentralConfig(tick_s=8.0, broadcast_s=8.0)
 
 
-def scenario(node_s=5.0):
-    base = thesis(60)
-    front = [
-        msgspec.structs.replace(r.front_end, node_s=node_s, sighting_s=1.0, particles=30)
-        for r in base.robots
-    ]
-    robots = zip(base.robots, front, strict=True)
-    return msgspec.structs.replace(
-        base,
-        robots=tuple(
-            msgspec.structs.replace(robot, front_end=f, pose_s=1e6) for robot, f in robots
-        ),
-    )
-
-
-SCENARIO = scenario()
+SCENARIO = with_robots(
+    with_front_ends(thesis(60), node_s=5.0, sighting_s=1.0, particles=30), pose_s=1e6
+)
 STREAMS = streams_of(SCENARIO)
 
 

@@ -17,7 +17,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, stamps
 from teamslam.team.wire.bus import Sample, opened
 from tests.central.test_withdrawal import messages, of_set, team_run
-from tests.final_maps import scenario_in
+from tests.scenarios import scenario_in
 from tests.sim.reruns import written
 from tests.trials.stress_world import StressWorld, write
 

@@ -15,7 +15,7 @@ from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
 from tests.central.test_withdrawal import messages, scenario, team_run
-from tests.final_maps import final_only, scenario_in
+from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 
 FIRST, LAST = 4, 6

@@ -15,7 +15,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import opened
-from tests.final_maps import final_only, scenario_in
+from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 
 AT_S = 100.0

@@ -20,7 +20,7 @@ from teamslam.team.estimation.map_joining.marginals import landmark_map
 from teamslam.team.estimation.map_joining.minima import MISFIT
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
-from tests.final_maps import final_only, scenario_in
+from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import Burst, CarriedOff, MovedLandmark, StressWorld, write
 
 WORLD = StressWorld(robots=2, landmarks=12, half_m=10.0, seconds=120.0)

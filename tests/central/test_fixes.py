@@ -23,7 +23,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
 from tests.central.test_survey import errors
-from tests.final_maps import final_only
+from tests.scenarios import final_only, with_front_ends, with_robots, with_world
 
 SIGMA_M = 0.3
 ANTENNA = (0.8, -0.5)
@@ -55,19 +55,11 @@ def day(
 ):
     """Samples of a team with fixes, and its world; live: with running maps and poses."""
     scenario = load("thesis-b")
-    world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=250)
-    robots = tuple(
-        msgspec.structs.replace(
-            each,
-            gnss=Gnss(antenna=ANTENNA, sigma_m=SIGMA_M),
-            front_end=msgspec.structs.replace(each.front_end, node_s=2.0),
-        )
-        for each in scenario.robots
-    )
+    scenario = with_world(scenario, unknown_starts=unknown, steps=250)
+    scenario = with_robots(scenario, gnss=Gnss(antenna=ANTENNA, sigma_m=SIGMA_M))
+    scenario = with_front_ends(scenario, node_s=2.0)
     central = msgspec.structs.replace(scenario.central, datum=DATUM)
-    scenario = msgspec.structs.replace(
-        scenario, seed=seed, world=world, robots=robots, central=central
-    )
+    scenario = msgspec.structs.replace(scenario, seed=seed, central=central)
     streams = streams_of(scenario)
     own = tuple(
         with_fixes(each, seed, np.array(origin), jumps) if each.robot in fixed else each

@@ -9,7 +9,7 @@ from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.source import streams_of
-from tests.final_maps import final_only, scenario_in
+from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, MovedLandmark, StressWorld, write
 
 WORLD = StressWorld(seed=3, landmarks=20, half_m=14.0, seconds=150.0)

@@ -28,8 +28,8 @@ from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests.air import Air
 from tests.bits import SETS
-from tests.final_maps import final_only
 from tests.peer_team import PeerTeam, peer_world
+from tests.scenarios import final_only, with_world
 from tests.support import example
 
 ALL = ("*",)
@@ -43,10 +43,7 @@ def day(seed, maps=(), *, moved=(), unknown=(), scenario="thesis-b", streams=Non
         places = [list(each) for each in day_of.world.landmarks]
         for number, (dx, dy) in dict(moved).items():
             places[number - 1] = [places[number - 1][0] + dx, places[number - 1][1] + dy]
-        world = msgspec.structs.replace(
-            day_of.world, landmarks=tuple(map(tuple, places)), unknown_starts=unknown
-        )
-        day_of = msgspec.structs.replace(day_of, world=world)
+        day_of = with_world(day_of, landmarks=tuple(map(tuple, places)), unknown_starts=unknown)
         streams = streams_of(day_of)
     centres = []
 
@@ -321,9 +318,7 @@ def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
 
 def test_peers_spread_a_saved_map_that_one_of_them_has_loaded():
     scenario = load("thesis-b")
-    scenario = msgspec.structs.replace(
-        scenario, seed=7, world=msgspec.structs.replace(scenario.world, steps=60)
-    )
+    scenario = msgspec.structs.replace(with_world(scenario, steps=60), seed=7)
     team = PeerTeam(scenario, Air())
     team.seats["r2"].node.load_maps([first_day()[1]])
     list(team.run(peer_world(scenario, streams_of(scenario))))
@@ -424,8 +419,7 @@ def hidden(seed, moved=()):
     places = np.array(day_of.world.landmarks)
     for number, by in moved:
         places[number - 1] += by
-    world = msgspec.structs.replace(day_of.world, landmarks=tuple(map(tuple, places.tolist())))
-    day_of = final_only(msgspec.structs.replace(day_of, world=world))
+    day_of = final_only(with_world(day_of, landmarks=tuple(map(tuple, places.tolist()))))
     return day_of, streams_of(day_of)
 
 

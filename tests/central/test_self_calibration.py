@@ -1,14 +1,13 @@
 from pathlib import Path
 
 import pytest
-from msgspec.structs import replace
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import messages as m
-from tests.final_maps import final_only, scenario_in
+from tests.scenarios import final_only, scenario_in, with_front_ends
 from tests.trials.stress_world import StressWorld, write
 
 TEAM = ("r1", "r2", "r3")
@@ -19,10 +18,7 @@ def mapped(world: StressWorld, place: Path, *, blind: bool = False) -> MapResult
     """The final map of this world; blind: without bias states."""
     scenario = final_only(scenario_in(write(world, place)))
     if blind:
-        robots = (
-            replace(each, front_end=replace(each.front_end, biases=())) for each in scenario.robots
-        )
-        scenario = replace(scenario, robots=tuple(robots))
+        scenario = with_front_ends(scenario, biases=())
     found = evaluate(run_team(scenario, streams_of(scenario))).map
     assert found.errors is not None
     return found

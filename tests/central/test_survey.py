@@ -20,7 +20,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
-from tests.final_maps import final_only
+from tests.scenarios import final_only, with_world
 
 SIGMA_M = 0.05
 UTM = (399_000.0, 5_756_000.0)
@@ -30,8 +30,9 @@ UTM = (399_000.0, 5_756_000.0)
 @cache
 def drive(seed, unknown=("*",)):
     scenario = load("thesis-b")
-    world = msgspec.structs.replace(scenario.world, unknown_starts=unknown, steps=200)
-    scenario = msgspec.structs.replace(scenario, seed=seed, world=world)
+    scenario = msgspec.structs.replace(
+        with_world(scenario, unknown_starts=unknown, steps=200), seed=seed
+    )
     streams = streams_of(scenario)
     return scenario, streams, list(run_team(final_only(scenario), streams))
 

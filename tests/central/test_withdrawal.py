@@ -33,6 +33,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests import build
+from tests.scenarios import with_front_ends, with_world
 from tests.sim.reruns import written
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
@@ -191,14 +192,7 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong):
 
 
 def test_a_robot_whose_wheels_are_a_third_too_large_stays_where_that_is_estimated():
-    of = scenario()
-    team = tuple(
-        msgspec.structs.replace(
-            each, front_end=msgspec.structs.replace(each.front_end, biases=CALIBRATED)
-        )
-        for each in of.robots
-    )
-    final = final_map(run(msgspec.structs.replace(of, robots=team), "odometry"))
+    final = final_map(run(with_front_ends(scenario(), biases=CALIBRATED), "odometry"))
     assert final.withdrawn == ()
     (found,) = final.diagnosis
     assert (found.cause, found.robot) == ("odometry_scale", "r3")
@@ -295,11 +289,9 @@ def test_nobody_is_withdrawn_from_a_team_in_which_nobody_is_wrong():
 
 
 def with_outliers(kind: OutlierKind, seed: int) -> Scenario:
-    of = scenario(landmark_submaps=2)
-    replaced = msgspec.structs.replace
-    team = tuple(replaced(r, front_end=replaced(r.front_end, particles=40)) for r in of.robots)
-    world = replaced(of.world, outlier_share=0.3, outlier_kind=kind)
-    return replaced(of, world=world, robots=team, seed=seed)
+    of = with_front_ends(scenario(landmark_submaps=2), particles=40)
+    of = with_world(of, outlier_share=0.3, outlier_kind=kind)
+    return msgspec.structs.replace(of, seed=seed)
 
 
 @pytest.mark.parametrize("kind", ["measurement", "identity"])

@@ -12,6 +12,7 @@ from teamslam.team import translate
 from teamslam.team.config import MotionModel, MotionNoise
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
+from tests.scenarios import with_front_ends, with_robots, with_world
 from tests.sim.reruns import written
 
 MOUNT = (0.8, -0.3, 0.2)
@@ -24,19 +25,9 @@ def scenario(estimator: str = "hybrid", fusion: str = "join", **world: object) -
     base = with_options(load("thesis-b"), estimator=estimator, fusion=fusion)
     forms = {"odometry": "increments", "odometry_claims": True, "landmark_form": "points",
              "landmark_claims": (0.5, 2.0), "steps": 40} | world  # fmt: skip
-    robots = tuple(
-        msgspec.structs.replace(
-            robot,
-            pose_s=10.0,
-            sensor=msgspec.structs.replace(robot.sensor, mount=MOUNT),
-            motion=MOTION,
-            front_end=msgspec.structs.replace(robot.front_end, particles=60),
-        )
-        for robot in base.robots
-    )
-    return msgspec.structs.replace(
-        base, world=msgspec.structs.replace(base.world, **forms), robots=robots
-    )
+    sensor = msgspec.structs.replace(base.robots[0].sensor, mount=MOUNT)
+    base = with_robots(with_world(base, **forms), pose_s=10.0, sensor=sensor, motion=MOTION)
+    return with_front_ends(base, particles=60)
 
 
 @cache

@@ -1,4 +1,3 @@
-import msgspec
 import numpy as np
 import pytest
 
@@ -17,6 +16,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids, octets, stamps
 from teamslam.team.wire.bus import opened
+from tests.scenarios import with_world
 from tests.sim.reruns import written
 
 STEPS = 50
@@ -24,8 +24,7 @@ STEPS = 50
 
 def hidden(**world):
     scenario = with_options(load("thesis-b"), seed=3, robots=1, identities="hidden")
-    changed = msgspec.structs.replace(scenario.world, steps=STEPS, **world)
-    return msgspec.structs.replace(scenario, world=changed)
+    return with_world(scenario, steps=STEPS, **world)
 
 
 @pytest.fixture(scope="module")

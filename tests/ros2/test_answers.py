@@ -2,7 +2,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import fields
 
-import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -24,6 +23,7 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh.foreign_keys import ForeignKeys
 from tests.ros2 import second_reader
+from tests.scenarios import with_world
 from tests.sim.reruns import team_samples, thesis, written
 from tests.support import example, packed, spd, wait_until
 
@@ -263,8 +263,7 @@ def test_type_hashes_are_those_of_ros():
 def test_two_readers_decode_the_same_bag_whose_truth_lies_at_the_paths(tmp_path, is_known):
     scenario = thesis(45)
     if not is_known:
-        world = msgspec.structs.replace(scenario.world, unknown_starts=("r1", "r2"))
-        scenario = msgspec.structs.replace(scenario, world=world)
+        scenario = with_world(scenario, unknown_starts=("r1", "r2"))
     bag = tmp_path / "bag"
     status = example(m.Status, node="r1")
     state = Sample(ch.STATUS.key("r1"), encoded(status), status.stamp_ns, 0, 0)

@@ -19,6 +19,7 @@ from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
+from tests.scenarios import with_world
 from tests.support import fused_map
 
 STEPS = 20
@@ -44,8 +45,7 @@ def scenario(seed: int = 1, robots: int = 1) -> Scenario:
 
 def without_starts(of: Scenario) -> Scenario:
     """The scenario with no known initial pose, so that the map's frame is arbitrary."""
-    world = msgspec.structs.replace(of.world, unknown_starts=("*",))
-    return msgspec.structs.replace(of, world=world)
+    return with_world(of, unknown_starts=("*",))
 
 
 def streams(of: Scenario) -> WorldStreams:

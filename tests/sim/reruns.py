@@ -15,6 +15,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
+from tests.scenarios import with_front_ends, with_world
 from tests.teams import Team
 
 Change = Callable[[m.Message], m.Message | None]
@@ -23,12 +24,7 @@ Change = Callable[[m.Message], m.Message | None]
 def thesis(steps: int, **options: str | int) -> Scenario:
     """The thesis world, shorter, with windows of 10 s."""
     scenario = with_options(load("thesis"), **options)
-    world = msgspec.structs.replace(scenario.world, steps=steps)
-    robots = tuple(
-        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, window_s=10.0))
-        for r in scenario.robots
-    )
-    return msgspec.structs.replace(scenario, world=world, robots=robots)
+    return with_front_ends(with_world(scenario, steps=steps), window_s=10.0)
 
 
 def team_samples(scenario: Scenario) -> list[Sample]:

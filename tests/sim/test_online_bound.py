@@ -4,6 +4,7 @@ import numpy as np
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.estimation.consistency import chi2_interval
+from tests.scenarios import with_world
 from tests.trials.online_bound import bounds
 
 SEEDS = range(2000, 2020)
@@ -11,8 +12,7 @@ SEEDS = range(2000, 2020)
 
 def bounds_of(seed, believed=lambda scenario: scenario):
     scenario = with_options(load("thesis-b"), seed=seed)
-    world = msgspec.structs.replace(scenario.world, steps=60)
-    scenario = msgspec.structs.replace(scenario, world=world)
+    scenario = with_world(scenario, steps=60)
     return bounds(believed(scenario), streams_of(scenario))
 
 

@@ -2,7 +2,6 @@ import sys
 from dataclasses import replace
 
 import gtsam
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,6 +20,7 @@ from teamslam.sim.studies.batch_reference.reference import BatchReference, batch
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig
 from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.se2 import compose, exponential
+from tests.scenarios import with_world
 from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
 
 small = st.floats(-0.3, 0.3)
@@ -66,8 +66,7 @@ def test_a_chain_has_the_measurements_in_order_each_once():
 
 
 def nees_of(of: Scenario, *, twice: bool) -> BatchReference:
-    world = msgspec.structs.replace(of.world, steps=8)
-    log = joined_log(msgspec.structs.replace(of, world=world), 0.02)
+    log = joined_log(with_world(of, steps=8), 0.02)
     return batch_map(counted_twice(log) if twice else log)
 
 

@@ -4,6 +4,7 @@ from scipy.stats import chi2
 
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.studies.batch_reference.reference import batch_map
+from tests.scenarios import with_robots, with_world
 from tests.sim.logs import joined_log, scenario, without_starts
 
 
@@ -17,9 +18,7 @@ def lasting_scenario(seed: int) -> Scenario:
         range_correlation_s=10.0,
         bearing_correlation_s=10.0,
     )
-    robots = tuple(msgspec.structs.replace(robot, sensor=sensor) for robot in of.robots)
-    world = msgspec.structs.replace(of.world, steps=8)
-    return msgspec.structs.replace(of, robots=robots, world=world)
+    return with_robots(with_world(of, steps=8), sensor=sensor)
 
 
 @pytest.mark.parametrize("kind", ["profile", "white"], ids=["profile", "mutant: white"])

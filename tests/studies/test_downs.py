@@ -1,20 +1,19 @@
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.studies.experiments.downs import TABLE_5_1
 from teamslam.sim.studies.experiments.downs_joined import spherical_task
 from teamslam.sim.studies.experiments.experiment import Dataset, Options, Results, runs_of
+from tests.scenarios import with_world
 
 SET_1 = Dataset("MRCLAM_Dataset1", Path("MRCLAM_Dataset1.zip"), "0" * 64)
 
 
 def test_submaps_of_a_step_make_a_map_with_the_identity_and_a_better_one_with_covariances():
     scenario = with_options(load("downs-100"), robots=2)
-    world = msgspec.structs.replace(scenario.world, steps=60)
-    result = spherical_task(msgspec.structs.replace(scenario, world=world)).run()
+    result = spherical_task(with_world(scenario, steps=60)).run()
     assert set(result["robots"]) == {"r1", "r2"}
     for robot in result["robots"].values():
         assert robot["submaps"] == pytest.approx(60, abs=2)

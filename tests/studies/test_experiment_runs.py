@@ -16,6 +16,7 @@ from teamslam.sim.studies.experiments.experiment import Options, Outcome, Result
 from teamslam.sim.studies.experiments.runner import FAILURES, Plan, compute_outcomes
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
+from tests.scenarios import with_world
 
 WORK = "json:loads"
 """A function that a process imports at once."""
@@ -27,8 +28,7 @@ def counted(rmse: float) -> Task:
 
 def short(steps: int) -> Scenario:
     scenario = load("thesis")
-    world = msgspec.structs.replace(scenario.world, steps=steps)
-    return msgspec.structs.replace(scenario, world=world)
+    return with_world(scenario, steps=steps)
 
 
 @pytest.mark.parametrize("estimator", ["localisation", "ekf-slam"])

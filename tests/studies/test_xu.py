@@ -11,6 +11,7 @@ from teamslam.sim.studies.experiments.curves import curves_run
 from teamslam.sim.studies.experiments.experiment import Options, Results, runs_of
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import FIGURE_4_4, FIGURE_5_2
+from tests.scenarios import with_world
 
 STEPS = 40
 
@@ -53,7 +54,7 @@ def test_as_coded_the_errors_are_far_below_those_as_stated(runs):
 
 def scenario(**change: object) -> Scenario:
     made = with_options(load("thesis"), robots=1)
-    return msgspec.structs.replace(made, world=msgspec.structs.replace(made.world, **change))
+    return with_world(made, **change)
 
 
 def test_the_coded_inputs_are_the_appendix_numbers():

@@ -25,7 +25,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
-from tests.final_maps import scenario_in
+from tests.scenarios import scenario_in
 from tests.sim.logs import final_map, samples
 from tests.trials.stress_world import StressWorld, write
 

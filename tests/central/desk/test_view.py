@@ -2,7 +2,6 @@ import json
 from collections import defaultdict
 
 import jsonschema
-import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -29,6 +28,7 @@ from teamslam.team.wire import views
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.codec import decoded
 from tests import build
+from tests.scenarios import with_world
 from tests.support import fused_map
 
 S = 1_000_000_000
@@ -37,9 +37,7 @@ S = 1_000_000_000
 @pytest.fixture(scope="module")
 def samples():
     scenario = with_options(load("thesis"), seed=1)
-    scenario = msgspec.structs.replace(
-        scenario, world=msgspec.structs.replace(scenario.world, steps=40)
-    )
+    scenario = with_world(scenario, steps=40)
     return list(run_team(scenario, streams_of(scenario)))
 
 

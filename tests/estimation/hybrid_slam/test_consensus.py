@@ -1,6 +1,5 @@
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +13,7 @@ from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.models import Increment, increment_of, noise_of, predicted
 from teamslam.team.estimation.scans import point_scan, polar_scan, unclaimed
 from teamslam.team.estimation.se2 import compose
+from tests.scenarios import with_world
 
 SENSOR = Sensor(range_sigma=0.1, bearing_sigma=0.02)
 MOTION = MotionModel(forward=MotionNoise(0.03), turn=MotionNoise(0.02), lateral=MotionNoise(0.01))
@@ -137,8 +137,7 @@ def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
 
 def world_of(name: str, kind: str, outlier_share: float) -> WorldStreams:
     scenario = load(name)
-    world = msgspec.structs.replace(scenario.world, outlier_share=outlier_share, outlier_kind=kind)
-    return streams_of(msgspec.structs.replace(scenario, world=world))
+    return streams_of(with_world(scenario, outlier_share=outlier_share, outlier_kind=kind))
 
 
 def rates(name: str, kind: str, by="confirmed") -> tuple[float, float]:

@@ -15,7 +15,7 @@ from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
-from tests.final_maps import final_only
+from tests.scenarios import final_only, with_front_ends, with_world
 from tests.teams import config, driven, published, stream
 
 
@@ -71,17 +71,8 @@ def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(mo
 
 def world_with(kind: str, steps: int = 200) -> Scenario:
     scenario = load("thesis-b")
-    world = msgspec.structs.replace(
-        scenario.world, steps=steps, outlier_share=0.3, outlier_kind=kind
-    )
-    robots = tuple(
-        msgspec.structs.replace(
-            each,
-            front_end=msgspec.structs.replace(each.front_end, particles=60),
-        )
-        for each in scenario.robots
-    )
-    return msgspec.structs.replace(scenario, world=world, robots=robots)
+    scenario = with_world(scenario, steps=steps, outlier_share=0.3, outlier_kind=kind)
+    return with_front_ends(scenario, particles=60)
 
 
 def aligned_rmse(scenario: Scenario) -> float:

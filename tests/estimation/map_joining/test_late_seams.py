@@ -20,7 +20,7 @@ from teamslam.team.estimation.map_joining.late_seams import find_late_seam
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from tests.estimation.association.unnamed_worlds import circle, drive
-from tests.final_maps import final_only, scenario_in
+from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))

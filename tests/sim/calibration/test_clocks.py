@@ -11,7 +11,7 @@ from teamslam.sim.calibration.figures import Figure
 from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from tests.final_maps import scenario_in
+from tests.scenarios import scenario_in
 from tests.trials.stress_world import StressWorld, write
 
 OFFSET_S = 0.5

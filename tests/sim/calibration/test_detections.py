@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,17 +14,22 @@ from teamslam.sim.world.streams import NO_LABEL
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import AssociationSettings
 from tests.estimation.association.unnamed_worlds import circle, drive
+from tests.scenarios import with_world
 
 REACH_M = 12.0
 
 
 def world(seed, clutter, missed):
     scenario = load("waypoints")
-    changed = msgspec.structs.replace(
-        scenario.world, size_m=60.0, landmark_count=60, visible_to_m=REACH_M, steps=150,
-        clutter=clutter, missed=missed,
-    )  # fmt: skip
-    scenario = msgspec.structs.replace(scenario, world=changed)
+    scenario = with_world(
+        scenario,
+        size_m=60.0,
+        landmark_count=60,
+        visible_to_m=REACH_M,
+        steps=150,
+        clutter=clutter,
+        missed=missed,
+    )
     scenario = with_options(scenario, seed=seed, robots=2, identities="hidden")
     return streams_of(scenario), scenario
 

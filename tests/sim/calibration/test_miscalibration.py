@@ -13,7 +13,7 @@ from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.simulator import simulate
 from teamslam.team.config import Bias, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
-from tests.final_maps import final_only
+from tests.scenarios import final_only
 
 SPEED = 0.25
 """[m/s]; the models below were calibrated at up to 0.09."""

@@ -2,7 +2,6 @@ import errno
 import os
 from io import StringIO
 
-import msgspec
 import pytest
 from click.exceptions import Exit
 from click.testing import CliRunner
@@ -19,6 +18,7 @@ from teamslam.sim.launch.launch import Outcome
 from teamslam.sim.scenarios.scenario import dumps
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
+from tests.scenarios import with_world
 from tests.sim.logs import scenario, streams
 
 
@@ -84,8 +84,7 @@ def test_a_router_killed_as_the_run_ends_is_a_note_where_map_and_log_are_whole(
 
 def test_a_run_whose_map_has_no_landmark_fails_with_the_reason(tmp_path):
     of = scenario()
-    world = msgspec.structs.replace(of.world, landmark_count=0, landmarks=())
-    of = msgspec.structs.replace(of, world=world)
+    of = with_world(of, landmark_count=0, landmarks=())
     log = tmp_path / "log.mcap"
     with Recorder(log, of.team, {"scenario": dumps(of)}) as recorder:
         recorder.write(list(run_team(of, streams(of))))

@@ -16,7 +16,7 @@ from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.world.config import GraphWorld
 from teamslam.team.estimation.se2 import between, compose
-from tests.final_maps import final_only
+from tests.scenarios import final_only
 
 ISAM = """# three poses, one landmark
 ODOMETRY 0 1 2 0 1.5707963267948966 50 0 0 20 0 100

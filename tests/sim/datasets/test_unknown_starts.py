@@ -1,6 +1,5 @@
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
@@ -9,15 +8,14 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
 from teamslam.sim.studies.experiments.team_runs import Figures, team_figures
+from tests.scenarios import with_robots, with_world
 
 SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
 
 
 def slice_of_set_6() -> Scenario:
     scenario = with_options(load("utias"), dataset=SET_6)
-    world = msgspec.structs.replace(scenario.world, duration_s=100.0)
-    robots = tuple(msgspec.structs.replace(robot, pose_s=60.0) for robot in scenario.robots)
-    return msgspec.structs.replace(scenario, world=world, robots=robots)
+    return with_robots(with_world(scenario, duration_s=100.0), pose_s=60.0)
 
 
 def figures(scenario: Scenario) -> Figures:

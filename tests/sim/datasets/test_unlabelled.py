@@ -1,6 +1,5 @@
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -19,6 +18,7 @@ from teamslam.sim.world.streams import FIXES, NO_LABEL, OBSERVATIONS, ODOMETRY
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.wire import messages as m
+from tests.scenarios import with_world
 
 
 def write(folder, **tables):
@@ -186,10 +186,7 @@ def test_launch_checks_a_log_of_one_robot_before_any_process_starts(steps, car):
 
 def written(place: Path, tagged: float) -> tuple:
     scenario = with_options(load("thesis-b"), robots=2, identities="hidden")
-    world = msgspec.structs.replace(
-        scenario.world, steps=12, clutter=0.3, missed=0.1, tagged=tagged
-    )
-    scenario = msgspec.structs.replace(scenario, world=world)
+    scenario = with_world(scenario, steps=12, clutter=0.3, missed=0.1, tagged=tagged)
     streams = streams_of(scenario)
     write_folder(streams, place)
     (place / "scenario.toml").write_text(folder_scenario(scenario))

@@ -28,6 +28,7 @@ from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStrea
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire import messages as m
 from tests import build
+from tests.scenarios import with_front_ends, with_world
 
 REAL = Path(__file__).parents[4] / "shared" / "utias"
 
@@ -236,8 +237,7 @@ def test_a_set_without_the_files_of_a_robot_is_run_by_the_others(folder):
     assert with_present_robots(whole) == (whole, None)
     for path in folder.glob("Robot1_*"):
         path.unlink()
-    world = msgspec.structs.replace(whole.world, unknown_starts=("*", "!r1"))
-    scenario, said = with_present_robots(msgspec.structs.replace(whole, world=world))
+    scenario, said = with_present_robots(with_world(whole, unknown_starts=("*", "!r1")))
     assert said == "r1: no files in MRCLAM_Dataset0; the team is r2"
     found = evaluate(run_team(loads(dumps(scenario)), streams_of(scenario)))
     assert list(found.robots) == ["r2"]
@@ -252,16 +252,11 @@ def mapped_by_waypoints(path):
     """The first 25 s of a set, with few particles and the models of its robots."""
     scenario = with_options(load("utias"), robots=2, dataset=path)
     robots = tuple(
-        msgspec.structs.replace(
-            robot,
-            front_end=msgspec.structs.replace(robot.front_end, particles=20),
-            sensor=of.sensor,
-            motion=of.motion,
-        )
+        msgspec.structs.replace(robot, sensor=of.sensor, motion=of.motion)
         for robot, of in zip(scenario.robots, load("waypoints").robots, strict=False)
     )
-    world = msgspec.structs.replace(scenario.world, odometry_delay_s=0.0, duration_s=25.0)
-    return msgspec.structs.replace(scenario, robots=robots, world=world)
+    scenario = with_front_ends(msgspec.structs.replace(scenario, robots=robots), particles=20)
+    return with_world(scenario, odometry_delay_s=0.0, duration_s=25.0)
 
 
 def landmarks_seen(streams: WorldStreams) -> np.ndarray:

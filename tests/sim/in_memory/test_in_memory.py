@@ -2,7 +2,6 @@ import os
 import subprocess
 import sys
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -13,13 +12,13 @@ from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import opened
+from tests.scenarios import with_world
 from tests.support import ROOT
 
 
 def thesis(estimator, fusion, seed=1, steps=30):
     scenario = with_options(load("thesis"), seed=seed, estimator=estimator, fusion=fusion)
-    world = msgspec.structs.replace(scenario.world, steps=steps)
-    return msgspec.structs.replace(scenario, world=world)
+    return with_world(scenario, steps=steps)
 
 
 def run(*args, **options):

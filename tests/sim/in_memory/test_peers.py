@@ -12,15 +12,14 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests.air import Air, Meeting, meetings
 from tests.peer_team import PeerTeam, peer_world
+from tests.scenarios import with_world
 
 SECOND = 1_000_000_000
 
 
 def scenario():
     scenario = with_options(load("thesis"), robots=3)
-    return msgspec.structs.replace(
-        scenario, world=msgspec.structs.replace(scenario.world, steps=32)
-    )
+    return with_world(scenario, steps=32)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from tests import build
+from tests.scenarios import with_world
 from tests.teams import stream, world_of
 
 SCENARIO = with_options(load("thesis"), robots=2)
@@ -78,9 +79,7 @@ def test_a_robot_that_is_not_in_the_scenario_is_named():
 
 
 def test_what_a_team_of_the_scenario_announces_is_what_is_expected():
-    short = msgspec.structs.replace(
-        SCENARIO, world=msgspec.structs.replace(SCENARIO.world, steps=3)
-    )
+    short = with_world(SCENARIO, steps=3)
     expected = expected_configurations(short)
     keys = {ch.CENTRAL_CONFIG.key(), *(ch.ROBOT_CONFIG.key(r.id) for r in short.robots)}
     said = [s.payload for s in run_team(short, streams_of(short)) if s.key in keys]

@@ -1,7 +1,6 @@
 import json
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -17,6 +16,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
+from tests.scenarios import with_front_ends
 from tests.sim.logs import scenario, streams, world_log
 
 
@@ -131,14 +131,7 @@ def test_a_log_without_a_map_is_placed_by_odometry(tmp_path):
 @pytest.fixture(scope="module")
 def data_set(tmp_path_factory):
     path = tmp_path_factory.mktemp("data")
-    team = scenario(robots=2)
-    robots = tuple(
-        msgspec.structs.replace(
-            robot, front_end=msgspec.structs.replace(robot.front_end, particles=20)
-        )
-        for robot in team.robots
-    )
-    team = msgspec.structs.replace(team, robots=robots)
+    team = with_front_ends(scenario(robots=2), particles=20)
     write_folder(streams_of(team), path)
     (path / "scenario.toml").write_text(folder_scenario(team))
     return path

@@ -15,6 +15,7 @@ from teamslam.sim.world.forms import (
 from teamslam.sim.world.sensing import Visible
 from teamslam.sim.world.simulator import simulate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
+from tests.scenarios import with_world
 
 MOTION = MotionModel(
     forward=MotionNoise(0.1), turn=MotionNoise(0.05), lateral=MotionNoise(0.04)
@@ -85,14 +86,15 @@ def test_forms_that_do_not_fit_are_named():
 
 def streams(form: str, identities: str):
     scenario = load("waypoints")
-    world = msgspec.structs.replace(
-        scenario.world,
-        steps=60,
-        landmark_form=form,
-        landmark_claims=(0.5, 2.0),
-        identities=identities,
-    )
-    return streams_of(msgspec.structs.replace(scenario, world=world)).streams
+    return streams_of(
+        with_world(
+            scenario,
+            steps=60,
+            landmark_form=form,
+            landmark_claims=(0.5, 2.0),
+            identities=identities,
+        )
+    ).streams
 
 
 @pytest.mark.parametrize("form", ["ranges", "points"])

@@ -14,7 +14,7 @@ from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.se2 import compose, inverse, logarithm
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
-from tests.final_maps import final_only
+from tests.scenarios import final_only
 from tests.teams import driven, published
 
 SLIP = {"lateral": MotionNoise(per_s=0.004), "final_turn": MotionNoise(per_s=0.003)}

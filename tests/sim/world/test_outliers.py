@@ -1,4 +1,3 @@
-import msgspec
 import numpy as np
 import pytest
 from scipy.stats import kstest
@@ -6,13 +5,13 @@ from scipy.stats import kstest
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
+from tests.scenarios import with_world
 from tests.sim.world.test_simulator import content
 
 
 def world_with(outlier_share: float, kind: str, name: str = "thesis-b") -> WorldStreams:
     scenario = load(name)
-    world = msgspec.structs.replace(scenario.world, outlier_share=outlier_share, outlier_kind=kind)
-    return streams_of(msgspec.structs.replace(scenario, world=world))
+    return streams_of(with_world(scenario, outlier_share=outlier_share, outlier_kind=kind))
 
 
 @pytest.fixture(scope="module")

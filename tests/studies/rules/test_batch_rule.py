@@ -1,4 +1,3 @@
-import msgspec
 import numpy as np
 import pytest
 
@@ -13,18 +12,14 @@ from teamslam.team.config import FrontEnd, RobotConfig, Sensor
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
+from tests.scenarios import with_front_ends, with_world
 from tests.sim.reruns import messages, team_samples
 from tests.teams import config, published, stream
 
 
 def team_run(world, fusion, estimator, steps):
     scenario = with_options(load(world), fusion=fusion, estimator=estimator)
-    robots = tuple(
-        msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, particles=50))
-        for r in scenario.robots
-    )
-    shorter = msgspec.structs.replace(scenario.world, steps=steps)
-    return team_samples(msgspec.structs.replace(scenario, world=shorter, robots=robots))
+    return team_samples(with_front_ends(with_world(scenario, steps=steps), particles=50))
 
 
 @pytest.mark.parametrize(("world", "steps"), [("thesis", 150), ("thesis-b", 150)])

@@ -1,0 +1,33 @@
+"""Scenarios with changed fields; `final_only` is for tests that read the final map alone."""
+
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+
+NEVER_S = 1e6
+
+
+def with_world(scenario: Scenario, **fields: object) -> Scenario:
+    return replace(scenario, world=replace(scenario.world, **fields))
+
+
+def with_robots(scenario: Scenario, **fields: object) -> Scenario:
+    robots = tuple(replace(robot, **fields) for robot in scenario.robots)
+    return replace(scenario, robots=robots)
+
+
+def with_front_ends(scenario: Scenario, **fields: object) -> Scenario:
+    robots = scenario.robots
+    changed = (replace(each, front_end=replace(each.front_end, **fields)) for each in robots)
+    return replace(scenario, robots=tuple(changed))
+
+
+def final_only(scenario: Scenario) -> Scenario:
+    central = replace(scenario.central, broadcast_s=NEVER_S)
+    return replace(with_robots(scenario, pose_s=NEVER_S), central=central)
+
+
+def scenario_in(folder: Path) -> Scenario:
+    return with_options(load(folder / "scenario.toml"), dataset=folder)
