@@ -33,7 +33,7 @@ PINNED_SIGMA = 1e-6
 
 
 class Look(NamedTuple):
-    """Landmark measurement `number` of a scan with its error state; before: gap_s earlier."""
+    """Landmark measurement `number` of a scan; before: gap_s earlier."""
 
     key: int
     chain: int
@@ -47,7 +47,7 @@ class Look(NamedTuple):
 
 
 def bias_key(chain: int) -> int:
-    """Key of a chain's biases (bearing [rad], range offset [m], range scale)."""
+    """Key of (bearing [rad], range offset [m], range scale) biases."""
     return _BIASES + chain
 
 
@@ -88,7 +88,7 @@ def profile_graph(
     robust_c: float | None,
     sigmas: BiasSigmas,
 ) -> Any:
-    """Make all factors, with the range noise at the joined solution's range.
+    """Make all factors.
 
     The Cauchy loss of scale c is on √(χ²/2) of each measurement.
     """
@@ -146,7 +146,7 @@ def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
 def _measurement(
     look: Look, keys: Sequence[int], scales: Float[np.ndarray, "2"]
 ) -> Callable[[Any, Any, Any], np.ndarray]:
-    """Residual (bearing [rad], range [m]) of a measurement, and its derivatives by `keys`."""
+    """Residual (bearing [rad], range [m]), and derivatives by `keys`."""
     across, along = scales.tolist()
 
     def residual(_: Any, values: Any, derivatives: Any) -> np.ndarray:

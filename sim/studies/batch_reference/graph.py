@@ -35,7 +35,7 @@ def load_gtsam() -> Any:
 
 
 def optimizer_of(gtsam: Any, graph: Any, initial: Any, iterations: int) -> Any:
-    """Make a Levenberg-Marquardt optimiser that runs to convergence."""
+    """Make a Levenberg-Marquardt optimiser."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     parameters.setRelativeErrorTol(1e-13)
@@ -58,7 +58,7 @@ def pose_key(chain: int, pose: int) -> int:
 def landmark_starts(
     chains: Sequence[Chain], poses: Sequence[Poses], joined: MapResult
 ) -> dict[int, Point]:
-    """Initial positions: the joined map's, else from the first measurement."""
+    """Positions of the joined map, else from the first measurement."""
     known = dict(zip(joined.ids.tolist(), joined.means, strict=True))
     found: dict[int, Point] = {}
     for chain, path in zip(chains, poses, strict=True):
@@ -78,7 +78,7 @@ def factor_graph(
 ) -> Any:
     """Make all factors, with the range noise at the joined solution's range.
 
-    Without a known initial pose the first chain starts as in the joined solution.
+    Without a known initial pose the first chain starts as joined.
     """
     graph = path_graph(gtsam, chains, poses)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
@@ -125,7 +125,7 @@ def under_loss(gtsam: Any, model: Any, c: float | None) -> Any:
 
 
 def start_factor(gtsam: Any, key: int, start: Pose, covariance: Matrix | None) -> Any:
-    """Prior of the initial pose; its covariance is rotated into the tangent space."""
+    """Prior of the initial pose, rotated into the tangent space."""
     if covariance is None:
         model = gtsam.noiseModel.Isotropic.Sigma(3, EXACT_SIGMA)
     else:

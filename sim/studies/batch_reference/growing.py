@@ -1,8 +1,8 @@
-"""Incremental batch MAP over all raw measurements of a team, by GTSAM.
+"""Incremental batch MAP over a team's raw measurements, by GTSAM.
 
-Minimises Σ rᵀP⁻¹r of initial poses and odometry + Σ ρ(rᵀR⁻¹r) of measurements over a pose per
-robot and keyframe and all landmarks (Dellaert & Kaess 2006). ρ: identity, or Cauchy's c² log(1 +
-χ²/c²). R: at the predicted range, not differentiated. Poses are perturbed on the right.
+Minimises Σ rᵀP⁻¹r of initial poses and odometry + Σ ρ(rᵀR⁻¹r) of measurements over a pose per robot
+and keyframe and all landmarks (Dellaert & Kaess 2006). ρ: identity, or Cauchy's c² log(1 + χ²/c²).
+R: at the predicted range, not differentiated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,16 +37,15 @@ _POSES = 2**32
 
 
 class UnsolvableError(ValueError):
-    """An unknown is undetermined, or a number overflows."""
+    """Undetermined unknown, or overflow."""
 
 
 @dataclass(frozen=True, eq=False)
 class GrowingBatch:
-    """Estimate of all poses and landmarks, in the map frame.
+    """Estimate of all poses and landmarks.
 
-    starts: initial poses with covariance in (x, y, θ); None: exact. poses: (x [m], y [m], θ
-    [rad]), initial poses first, then one per step. robust_c: Cauchy's scale on √χ²; None: least
-    squares.
+    starts: initial poses with covariance in (x, y, θ); None: exact. poses: (x [m], y [m], θ [rad]),
+    initial poses first, then one per step. robust_c: Cauchy's scale on √χ².
     """
 
     starts: Mapping[str, tuple[Pose, Matrix | None]]
@@ -61,7 +60,7 @@ class GrowingBatch:
         return np.array(sorted(self.landmarks), np.uint32)
 
     def places(self, robot: str) -> list[int]:
-        """Rows of a robot's poses, initial pose first; raises ValueError without one."""
+        """Rows of a robot's poses, initial pose first."""
         robots = list(self.starts)
         if robot not in self.starts:
             raise ValueError(f"{robot} has no start")
@@ -75,7 +74,7 @@ class GrowingBatch:
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom 2 n − 2 L for n measurements and L landmarks."""
+        """2 n − 2 L for n measurements and L landmarks."""
         return 2 * sum(len(step.ids) for step in self.steps) - 2 * len(self.landmarks)
 
     @cached_property
@@ -106,7 +105,7 @@ class GrowingBatch:
         return self.graph(self.robust_c)
 
     def graph(self, robust_c: float | None) -> Any:
-        """Make the factors, with measurement noise at the present estimate."""
+        """Make the factors at the present estimate."""
         gtsam = load_gtsam()
         graph = gtsam.NonlinearFactorGraph()
         floor = np.diag(FLOOR_SIGMAS) ** 2
@@ -150,10 +149,7 @@ def initial_state(
 
 
 def add_steps(batch: GrowingBatch, steps: Sequence[RobotStep]) -> GrowingBatch:
-    """Append steps: dead-reckon poses, place new landmarks by their first measurement.
-
-    Raises ValueError for a robot without an initial pose.
-    """
+    """Append steps: dead-reckon poses, place landmarks by their first measurement."""
     newest = {robot: batch.poses[batch.places(robot)[-1]] for robot in batch.starts}
     poses, landmarks = [*batch.poses], dict(batch.landmarks)
     for step in steps:
@@ -231,7 +227,7 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
-    """Mean and marginal covariance of the newest pose in (x, y, θ); raises ValueError."""
+    """Mean and marginal covariance of the newest pose in (x, y, θ)."""
     place = batch.places(robot)[-1]
     return PoseGaussian(batch.poses[place], _covariance(batch, place))
 
@@ -239,7 +235,7 @@ def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:
 def trajectory(
     batch: GrowingBatch, robot: str
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """Poses of the robot with marginal covariances in (x, y, θ)."""
+    """Poses with marginal covariances in (x, y, θ)."""
     own = batch.places(robot)
     return batch.poses[own], np.array([_covariance(batch, place) for place in own])
 
@@ -260,7 +256,7 @@ def solved_map(
     initial_poses: Mapping[str, InitialPose],
     robust_c: float | None,
 ) -> BatchMap:
-    """Solve for all poses and landmarks, as `teamslam.team.library.batch_map`."""
+    """Solve for all poses and landmarks."""
     starts = {robot: (each.pose, each.covariance) for robot, each in initial_poses.items()}
     robots = sorted(keyframes)
     steps = [

@@ -1,9 +1,8 @@
 """Batch reference: the MAP over all raw measurements of a log, by GTSAM.
 
-A pose of each robot's sensor per keyframe. Factors: initial poses; odometry, truth = mean ∘ Exp(ξ)
-with the covariance of `increment_of`; accepted ranges and bearings, under a Cauchy loss with the
-centre's `batch_robust_c`. Starts from the joined solution. Noise `white`: independent errors,
-without inter-robot measurements; `profile`: see `errors`.
+A pose of each robot's sensor per keyframe. Factors: initial poses; odometry, truth = mean ∘ Exp(ξ);
+accepted ranges and bearings, under a Cauchy loss with `batch_robust_c`. Noise `white`: independent
+errors, without inter-robot measurements; `profile`: see `errors`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -62,9 +61,9 @@ NO_BIASES = (None, None, None)
 class BatchReference:
     """Optimum of the batch.
 
-    cost = Σ‖r‖²; initial_cost: at the best start. gradient_norm: of the cost; newton_decrement:
-    √(gᵀH⁻¹g). left_out: robots without a known place, with the reason. biases: (bearing [rad],
-    range offset [m], range scale) by robot. team: the run's own final map. arbitrary: the frame is.
+    cost = Σ‖r‖²; initial_cost: at the best start. newton_decrement: √(gᵀH⁻¹g). left_out: robots
+    without a known place. biases: (bearing [rad], range offset [m], range scale) by robot. team:
+    the run's own map. arbitrary: the frame is.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -128,10 +127,7 @@ def _map_figures(errors: MapErrors | None, *, arbitrary: bool) -> dict[str, Any]
 
 
 def batch_map(samples: Iterable[Sample], noise: NoiseKind = "white") -> BatchReference:
-    """Compute the batch MAP of a whole run's log under the rule `join` or `batch`.
-
-    Raises BatchReferenceError without GTSAM, scenario, joined map or convergence.
-    """
+    """Batch MAP of a log under the rule `join` or `batch`; raises BatchReferenceError."""
     gtsam = _gtsam()
     recorded = list(samples)
     run = evaluate(recorded)
@@ -224,7 +220,7 @@ def _optimise(gtsam: Any, graph: Any, initial: Any) -> Any:
 
 
 def _after_step(gtsam: Any, graph: Any, initial: Any) -> Any:
-    """Gauss-Newton with step halving, five times faster than GTSAM's solver with Python factors."""
+    """Gauss-Newton with step halving, five times faster than GTSAM's solver here."""
     values, cost = initial, graph.error(initial)
     for _ in range(ITERATIONS):
         step, decrement = newton_step(gtsam, graph.linearize(values))

@@ -22,7 +22,7 @@ class DeadReckoning:
 
 
 def initial_state(pose: Pose) -> DeadReckoning:
-    """Start at an exact pose (else step first by `uncertain_start`)."""
+    """Start at an exact pose."""
     return DeadReckoning(Increment(pose, np.zeros((3, 3))))
 
 

@@ -1,4 +1,4 @@
-"""EKF-SLAM with known data association: one Gaussian over the pose and all landmarks.
+"""EKF-SLAM with known data association.
 
 Smith, Self and Cheeseman 1990; Thrun et al. 2005, table 10.1. Over a long run the covariance
 becomes too small (Julier and Uhlmann 2001).
@@ -22,7 +22,7 @@ Array = Float[np.ndarray, "..."]
 
 
 def see(poses: Array, landmarks: Array) -> tuple[Array, Array, Array]:
-    """Distance d ≥ NEAREST_M and unit vector (ex, ey) from each pose to its landmark."""
+    """Distance d ≥ NEAREST_M and unit vector to each landmark."""
     dx, dy = landmarks[..., 0] - poses[..., 0], landmarks[..., 1] - poses[..., 1]
     distance = np.sqrt(dx * dx + dy * dy)
     near = distance < NEAREST_M
@@ -49,10 +49,9 @@ def advance(
     measurements: Float[np.ndarray, "k 2"],
     sensor: Variances,
 ) -> bool:
-    """Step the pose and the first `known` landmarks; False: mean and P are invalid.
+    """Step the pose and the first `known` landmarks; False: S is not positive definite.
 
-    slots: landmark of each measurement in the state; first: first sight of it. Fails if S is not
-    positive definite.
+    slots: landmark of each measurement in the state; first: first sight of it.
     """
     size = 3 + 2 * known
     before, P_before = mean[:size], P[:size, :size]
@@ -107,7 +106,7 @@ def _place(
     measurement: Float[np.ndarray, "2"],
     sensor: Variances,
 ) -> None:
-    """Place a new landmark in the entries `at` and at + 1 of the state.
+    """Place a landmark in the entries `at` and at + 1.
 
     g = (x, y) + r (cos, sin)(theta + b), G_p = ∂g/∂pose: P_l· = G_p P_p·, P_ll = G_p P_pp G_pᵀ +
     G_z R G_zᵀ.
@@ -125,10 +124,10 @@ def _place(
 
 
 class _Sights:
-    """Measurement matrix H: two rows (range, bearing) for each landmark at `places` of the state.
+    """H: two rows (range, bearing) for each landmark at `places`.
 
-    H v = (e·δ, e⊥·δ/d − v_theta) with distance d, unit vector e = (ex, ey) to the landmark, e⊥ =
-    (−ey, ex), and δ the landmark's entries of v less the position's.
+    H v = (e·δ, e⊥·δ/d − v_theta) with distance d, unit vector e to the landmark, e⊥ = (−ey, ex),
+    and δ the landmark's entries of v less the position's.
     """
 
     def __init__(self, mean: Float[np.ndarray, " n"], places: Int64[np.ndarray, " t"]) -> None:
@@ -152,10 +151,10 @@ def _condition(
     measurements: Float[np.ndarray, "t 2"],
     sensor: Variances,
 ) -> bool:
-    """Update by measurements of the landmarks at `places`, linearised at the state before.
+    """Update by measurements, linearised at the state before.
 
-    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), P by `_joseph`. False: S is not
-    positive definite.
+    S = H P Hᵀ + R, K = P Hᵀ S⁻¹, x ← x + K (z − h(x)), P by `_joseph`. False: S is not positive
+    definite.
     """
     m = 2 * len(places)
     if m == 0:
@@ -187,8 +186,7 @@ def _joseph(
 ) -> None:
     """P ← A P Aᵀ + K R Kᵀ with A = I − K H and Kᵀ = `gains`, in place.
 
-    Each row b of A P becomes b − (b Hᵀ − K_j R) Kᵀ; H is five entries wide. The lower triangle is
-    copied, so P stays symmetric.
+    Each row b of A P becomes b − (b Hᵀ − K_j R) Kᵀ; H is five entries wide.
     """
     for k in range(len(HP)):
         P -= gains[k][:, None] * HP[k]
@@ -199,7 +197,7 @@ def _joseph(
 
 
 def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) -> bool:
-    """B ← S⁻¹ B by Cholesky, S = L Lᵀ, in place; False if S is not positive definite."""
+    """B ← S⁻¹ B by Cholesky; False if S is not positive definite."""
     m = len(S)
     for k in range(m):
         if not S[k, k] > 0.0:
@@ -219,9 +217,9 @@ def _solve_in_place(S: Float[np.ndarray, "m m"], B: Float[np.ndarray, "m n"]) ->
 
 @dataclass(frozen=True)
 class EkfSlam:
-    """N(mean, covariance) of (pose, landmarks in order of first sight) in the map frame.
+    """N(mean, covariance) of (pose, landmarks in order of first sight).
 
-    mean: (x [m], y [m], theta [rad], x₁, y₁, …), theta in (−π, π].
+    mean: (x [m], y [m], theta [rad], x₁, y₁, …).
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -230,14 +228,14 @@ class EkfSlam:
 
 
 def initial_state(pose: Pose) -> EkfSlam:
-    """Start at an exact pose (else step first by `uncertain_start`)."""
+    """Start at an exact pose."""
     return EkfSlam(np.empty(0, np.uint32), pose, np.zeros((3, 3)))
 
 
 def filter_step(state: EkfSlam, step: RobotStep) -> EkfSlam:
     """Move, update by all known landmarks at once, then place the new ones.
 
-    Further measurements of a new landmark update it. Raises NotACovarianceError.
+    Further measurements of a new landmark update it.
     """
     ids_after, slots, first = slots_of(state.ids, step.ids)
     n = 3 + 2 * len(ids_after)
@@ -278,7 +276,7 @@ def landmark_gaussian(state: EkfSlam) -> LandmarkGaussian:
 
 
 def local_map(state: EkfSlam) -> LocalMap:
-    """The whole Gaussian, landmarks by ascending id."""
+    """The whole Gaussian."""
     order = np.argsort(state.ids)
     columns = (3 + 2 * order[:, None] + np.arange(2)).ravel()
     at = np.concatenate((np.arange(3), columns))

@@ -1,7 +1,7 @@
-"""FastSLAM 1.0 with maximum-likelihood data association in each particle.
+"""FastSLAM 1.0 with maximum-likelihood data association in each particle (Montemerlo and Thrun
+2003).
 
-Montemerlo and Thrun 2003. Beyond the gate a detection is a new landmark; the heaviest particle has
-the map.
+Beyond the gate a detection is a new landmark; the heaviest particle has the map.
 """
 
 from dataclasses import dataclass, replace
@@ -19,10 +19,10 @@ from teamslam.team.shapes import Float, Int64
 
 @dataclass(frozen=True)
 class FastSlamMl:
-    """M particles with C landmark slots, of which the first counts[m] are used.
+    """M particles with C landmark slots, the first counts[m] used.
 
-    seen: detections per slot. took: slot of each detection, by particle. resample_below: relative
-    effective sample size below which a step resamples.
+    seen: detections per slot. took: slot of each detection. resample_below: relative effective
+    sample size.
     """
 
     poses: Float[np.ndarray, "M 3"]
@@ -38,7 +38,7 @@ class FastSlamMl:
 def initial_state(
     poses: Float[np.ndarray, "M 3"], logs: Float[np.ndarray, " M"], resample_below: float
 ) -> FastSlamMl:
-    """Make particles without landmarks; logs: of the weights."""
+    """Make particles without landmarks."""
     particles = len(poses)
     return FastSlamMl(
         poses=poses,

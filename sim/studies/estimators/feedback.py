@@ -19,9 +19,9 @@ def carry_along(
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]]:
     """Joint Gaussian of (own others o, everything new) after the shared part s was replaced.
 
-    The entries `shared` become the entries `in_new` of the new N(m, C); the conditional of o given
-    s stays (Jeffrey's rule): with K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s), P_oo − K
-    P_so + K C_ss Kᵀ, and K C_s· with everything new.
+    The entries `shared` become `in_new` of N(m, C); the conditional of o given s stays (Jeffrey's
+    rule): with K = P_os P_ss⁻¹ the others have x_o + K (m_s − x_s), P_oo − K P_so + K C_ss Kᵀ, and
+    K C_s· with everything new.
     """
     others = np.setdiff1d(np.arange(len(mean)), shared)
     own = information(covariance[np.ix_(shared, shared)], "the part to be replaced")

@@ -1,7 +1,7 @@
 """Hybrid-SLAM as stated in the thesis: after each step all particles become their weighted mean.
 
 W. Xu, sections 4.2 and 4.3. The reset makes covariances far too small. Corrected: a landmark's
-initial covariance follows from the measurement (thesis: 30 m), and weights restart with each step.
+initial covariance (thesis: 30 m), and weights restart with each step.
 """
 
 from dataclasses import dataclass, replace
@@ -18,11 +18,10 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class ThesisState:
-    """Mean pose and independent landmarks, in the map frame.
+    """Mean pose and independent landmarks.
 
-    pose: (x [m], y [m], theta [rad]). pose_covariance: of the last step's particles, may be
-    singular. ids: strictly ascending. landmarks: [m]; covariances: [m²].
-    particles: their number in a step.
+    pose: (x [m], y [m], theta [rad]). pose_covariance: of the last step's particles. ids:
+    ascending. landmarks: [m]. particles: their number.
     """
 
     pose: Pose
@@ -34,16 +33,13 @@ class ThesisState:
 
 
 def initial_state(pose: Pose, particles: int) -> ThesisState:
-    """Start at an exact pose without landmarks."""
+    """Start at an exact pose."""
     none = np.empty((0, 2)), np.empty((0, 2, 2))
     return ThesisState(pose, np.zeros((3, 3)), np.empty(0, np.uint32), *none, particles)
 
 
 def filter_step(state: ThesisState, step: RobotStep, generator: np.random.Generator) -> ThesisState:
-    """Sample poses about the mean, update and weigh (FastSLAM 1.0), reset to eq. 4.5-4.6.
-
-    Unmeasured landmarks keep their bits.
-    """
+    """Sample poses about the mean, update and weigh (FastSLAM 1.0), reset to eq. 4.5-4.6."""
     drawn = reset(state, step.ids, state.particles)
     after = step.fastslam(drawn, "fastslam1", generator)
     mean, P = moments(after.poses, core.exp(after.log_weights), after.means, after.covariances, 1.0)

@@ -33,7 +33,7 @@ class CodedState:
 
 
 def initial_state(pose: Pose, particles: int) -> CodedState:
-    """Start at an exact pose without landmarks."""
+    """Start at an exact pose."""
     at = fastslam.at_poses(np.tile(pose, (particles, 1)))
     return CodedState(at, at)
 

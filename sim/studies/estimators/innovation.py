@@ -19,12 +19,13 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 
 def innovation(particles: Particles, step: RobotStep) -> Innovation:
-    """ν = z − ẑ of one keyframe's measurements, with their joint predictive covariance.
+    """ν = z − ẑ of a keyframe, with joint predictive covariance.
 
-    Moments of the mixture Σ wᵢ N(ẑᵢ, Sᵢ) that the particles before predict for known landmarks:
+    Moments of the mixture Σ wᵢ N(ẑᵢ, Sᵢ) of the particles before:
+
         ẑᵢ = h(poseᵢ ∘ mean, landmarks),  Sᵢ = Hₓ Q Hₓᵀ + Hₗ Σᵢ Hₗᵀ + R,
-        S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ, bearings on the circle.
-    Noises are the measurements' own, or the sensor's; R is white. Raises NotACovarianceError.
+
+        S = Σ wᵢ (Sᵢ + dᵢ dᵢᵀ),  dᵢ = ẑᵢ − ẑ.
     """
     with CoreErrors():
         window = core.Window.of_particles(*particles.arrays, noise_of(step.sensor))

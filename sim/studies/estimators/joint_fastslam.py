@@ -21,10 +21,10 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class JointFastSlam:
-    """M particles (x¹, …, xᴿ, m, w); see `fastslam.Particles`.
+    """M particles (x¹, …, xᴿ, m, w).
 
     poses: (x [m], y [m], theta [rad]) by robot and particle. resample_below: relative effective
-    sample size below which a step first resamples; 1: always.
+    sample size; 1: always.
     """
 
     robots: tuple[str, ...]
@@ -40,7 +40,7 @@ class JointFastSlam:
 def initial_state(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
-    """Start at exact poses (else turn first by `uncertain_start`)."""
+    """Start at exact poses."""
     none = fastslam.at_poses(np.zeros((particles, 3)))
     return JointFastSlam(
         robots=tuple(poses),
@@ -57,10 +57,7 @@ def initial_state(
 def filter_step(
     state: JointFastSlam, turns: Sequence[RobotStep], generator: np.random.Generator
 ) -> JointFastSlam:
-    """Resample if the particles are thin, then process the robots' turns in order.
-
-    Each turn multiplies the weights by p(zʳ | …). Raises ValueError for an unknown robot.
-    """
+    """Resample if the particles are thin, then process the robots' turns, each with p(zʳ | …)."""
     thin = state.resample_below * len(state.log_weights)
     if fastslam.effective_sample_size(state.log_weights) < thin:
         parents = fastslam.systematic_parents(state.log_weights, generator.random())
@@ -88,7 +85,7 @@ def filter_step(
 
 
 def pose_gaussian(state: JointFastSlam, robot: str) -> PoseGaussian:
-    """Mean and covariance of one robot's poses; raises ValueError for an unknown one."""
+    """Mean and covariance of one robot's poses."""
     return pose_moments(_particles_of(state, state.robots.index(robot)))
 
 

@@ -1,7 +1,7 @@
-"""Monte Carlo localisation: weighted poses on an exactly known map; the start may be unknown.
+"""Monte Carlo localisation on an exactly known map.
 
-p(pose | z, u, map) by prediction, weighing and resampling: Xu's thesis, section 3.5.1 (eq. 3.23 to
-3.25); Dellaert et al. 1999; Thrun et al. 2005, table 8.2.
+p(pose | z, u, map) by prediction, weighing and resampling: Xu's thesis, section 3.5.1; Dellaert et
+al. 1999; Thrun et al. 2005, table 8.2.
 """
 
 import math
@@ -24,10 +24,9 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class Localisation:
-    """Weighted poses and their map.
+    """Weighted poses and their map [m].
 
-    cloud: particles without landmarks. ids, landmarks: the map, ids strictly ascending, [m].
-    resample_below: relative effective sample size below which a step resamples.
+    cloud: particles without landmarks. resample_below: relative effective sample size.
     """
 
     cloud: Particles
@@ -42,7 +41,7 @@ def initial_state(
     ids: UInt32[np.ndarray, " L"],
     landmarks: Float[np.ndarray, "L 2"],
 ) -> Localisation:
-    """Start at an exact pose (else step first by `uncertain_start`)."""
+    """Start at an exact pose."""
     return Localisation(fastslam.at_poses(np.tile(pose, (particles, 1))), ids, landmarks)
 
 
@@ -54,7 +53,7 @@ def initial_state_anywhere(
     landmarks: Float[np.ndarray, "L 2"],
     generator: np.random.Generator,
 ) -> Localisation:
-    """Draw poses uniformly over a rectangle [m] and all headings (Xu, figure 3.5a)."""
+    """Draw poses over a rectangle [m] and all headings (Xu, figure 3.5a)."""
     low, high = np.append(lowest, -np.pi), np.append(highest, np.pi)
     poses = high - (high - low) * generator.random((particles, 3))
     return Localisation(fastslam.at_poses(poses), ids, landmarks)
@@ -63,10 +62,7 @@ def initial_state_anywhere(
 def filter_step(
     state: Localisation, step: RobotStep, generator: np.random.Generator
 ) -> Localisation:
-    """Resample if the cloud is thin, draw the motion, multiply the weights by Π p(z | pose, map).
-
-    Unmapped landmarks are left out.
-    """
+    """Resample a thin cloud, draw the motion, multiply the weights by Π p(z | pose, map)."""
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)
     if fastslam.effective_sample_size(cloud.log_weights) < thin:

@@ -1,4 +1,4 @@
-"""EKF-SLAM over the whole run with nearest-neighbour data association.
+"""EKF-SLAM with nearest-neighbour data association.
 
 Individual compatibility (Neira and Tardós 2001, section II), the best pair of a scan first; beyond
 the gate a landmark is new.

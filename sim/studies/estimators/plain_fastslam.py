@@ -1,4 +1,4 @@
-"""FastSLAM over the whole run: one set of particles from start to end.
+"""FastSLAM with one set of particles from start to end.
 
 Montemerlo 2003; Xu's thesis, section 3.5.3; Ma & Ma, section IV-C. Particles come to share their
 early path, so the landmarks' covariance is far too small.
@@ -19,7 +19,7 @@ from teamslam.team.estimation.se2 import Pose
 
 @dataclass(frozen=True)
 class PlainFastSlam:
-    """Weighted particles in the map frame, with their proposal and resampling.
+    """Weighted particles, with their proposal.
 
     resample_below: relative effective sample size (Xu: 0.5); 1: always (Ma & Ma, Montemerlo).
     """
@@ -32,7 +32,7 @@ class PlainFastSlam:
 def initial_state(
     pose: Pose, particles: int, proposal: Proposal, resample_below: float
 ) -> PlainFastSlam:
-    """Start at an exact pose (else step first by `uncertain_start`)."""
+    """Start at an exact pose."""
     poses = np.tile(pose, (particles, 1))
     return PlainFastSlam(fastslam.at_poses(poses), proposal, resample_below)
 
@@ -49,7 +49,7 @@ def filter_step(
 
 
 def pose_gaussian(state: PlainFastSlam) -> PoseGaussian:
-    """Moments of the particles' poses, the heading on the circle."""
+    """Moments of the particles' poses."""
     return pose_moments(state.particles)
 
 

@@ -20,9 +20,9 @@ POSE_FLOOR = np.diag([1e-6, 1e-6, 1e-8])
 
 
 class RobotStep(NamedTuple):
-    """Motion of a robot since its last step, and the measurements at its end, none by default.
+    """Motion of a robot, and calibrated measurements [m, rad] at its end.
 
-    ranges [m] and bearings [rad] are calibrated; own: their covariances, or no rows.
+    own: their covariances, or no rows.
     """
 
     robot: str
@@ -52,10 +52,7 @@ class RobotStep(NamedTuple):
 
 
 def uncertain_start(pose: Pose, covariance: Matrix) -> Increment:
-    """Zero motion with the noise of an initial pose N(pose, covariance).
-
-    In the pose's own axes the noise is C = GᵀPG, G = blkdiag(R(θ), 1).
-    """
+    """Zero motion with the noise C = GᵀPG of an initial pose, G = blkdiag(R(θ), 1)."""
     G = tangent(pose[2])
     own = dense.product(dense.product(G.T, covariance), G)
     return Increment(np.zeros(3), 0.5 * (own + own.T))

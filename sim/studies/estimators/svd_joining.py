@@ -1,8 +1,7 @@
 """Map joining as in Downs' thesis: least squares with spherical covariances, frames tied by SVD.
 
-argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) over submaps (eq. 4.1) with P the identity: a radian counts
-as a metre. Robots that measure each other exchange maps, aligned by SVD and joined by their
-landmarks (sections 3.2 and 4.3, appendix II).
+argmin Σ (X̂ − H(X))ᵀ P⁻¹ (X̂ − H(X)) over submaps (eq. 4.1) with P the identity: a radian counts as
+a metre. Robots that measure each other exchange maps (sections 3.2 and 4.3, appendix II).
 """
 
 from collections.abc import Mapping
@@ -39,10 +38,9 @@ class TooFewPointsError(ValueError):
 
 
 def reweight(local: LocalMap, weighting: Weighting) -> LocalMap:
-    """Replace a submap's covariance for the join.
+    """Replace a submap's covariance.
 
-    "identity": I. "spherical": half the trace of each block times I, no correlations. "full":
-    unchanged.
+    "identity": I. "spherical": half the trace of each block times I. "full": unchanged.
     """
     if weighting == "full":
         return local
@@ -86,7 +84,7 @@ def solve(state: SubmapJoining) -> SubmapJoining:
 
 
 def variance_factor(state: SubmapJoining) -> float:
-    """Variance factor σ̂² of the solution's covariance.
+    """Variance factor σ̂².
 
     With the identity Σ‖r‖²/(residuals − unknowns), 1 without redundancy; else 1.
     """
@@ -98,7 +96,7 @@ def variance_factor(state: SubmapJoining) -> float:
 
 
 def landmark_gaussian(state: SubmapJoining) -> LandmarkGaussian:
-    """All landmarks: σ̂² (JᵀP⁻¹J)⁻¹; raises KeyError before the first submap."""
+    """All landmarks: σ̂² (JᵀP⁻¹J)⁻¹."""
     landmarks = state.fold.main.graph.landmarks
     ids = sorted(landmarks)
     mean, covariance = joint_marginal(state.fold.main, [landmarks[id_] for id_ in ids])
@@ -131,7 +129,7 @@ def mutual_sighting(
     range_to_a: float,
     bearing_to_a: float,
 ) -> PointPairs:
-    """Positions of two robots that measure each other, in both maps (Downs, chapter 3)."""
+    """Positions of two robots in both maps (Downs, chapter 3)."""
     return PointPairs(
         np.stack((pose_a[:2], located(pose_a, range_to_b, bearing_to_b))),
         np.stack((located(pose_b, range_to_a, bearing_to_a), pose_b[:2])),
@@ -143,11 +141,10 @@ def exchange_maps(
 ) -> ExchangedMap:
     """Join two maps in the frame of a, by common landmarks and the robots' positions.
 
-    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over x and (R, t): each common xᵢ is the middle of its
-    points, (R, t) is by `procrustes`. With n common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂²
-    (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have σ̂² D + E Σ_T Eᵀ: D = 1, E = 0 of a alone, 1 and G of b
-    alone, 1/2 and G/2 common; σ̂² = cost/(2n − 3). As in Downs, the maps' covariances are
-    discarded. Raises TooFewPointsError.
+    argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over x and (R, t): (R, t) is by `procrustes`. With n
+    common points and G = ∂(R b + t)/∂(t, θ), Σ_T = 2 σ̂² (Σ GᵢᵀGᵢ)⁻¹ and the landmarks have σ̂² D +
+    E Σ_T Eᵀ: D = 1, E = 0 of a alone, 1 and G of b alone, 1/2 and G/2 common; σ̂² = cost/(2n − 3).
+    The maps' covariances are discarded. Raises TooFewPointsError.
     """
     ids = np.union1d(a.ids, b.ids)
     of_a, of_b = np.searchsorted(ids, a.ids), np.searchsorted(ids, b.ids)
@@ -196,7 +193,7 @@ STANDS_STILL = 1e-9
 
 
 def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
-    """Join two independent maps in the frame of a, each with its own covariance.
+    """Join two maps in the frame of a, with their covariances.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over x and (t, θ); covariance (JᵀWJ)⁻¹.
     Raises TooFewPointsError, NotACovarianceError.

@@ -1,9 +1,8 @@
 """Worlds with few landmarks and unknown initial poses, where wrong minima occur.
 
 A map is wrong in another minimum than the truth's (`true_minimum`), silent without a warning, and
-beyond its ellipsoid if its shape or a joined robot's first pose is outside the 99.9 % region.
-Submaps exclude the truth beyond the 99.9 % quantile of the cost. An alarm is a warning of a right
-map about more than a large or nonlinear covariance.
+beyond its ellipsoid if its shape or a first pose is outside the 99.9 % region. An alarm is a
+warning of a right map about more than a large or nonlinear covariance.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -106,7 +105,7 @@ def _alarmed(run: Figures) -> bool:
 
 
 def is_beyond(run: Figures) -> bool:
-    """Whether shape or a first pose is beyond its 99.9 % ellipsoid."""
+    """Whether shape or a first pose is outside its 99.9 % ellipsoid."""
     dof = 2 * round(run["landmarks"] or 0.0) - 3
     shape = run["shape_nees"]
     if shape is not None and dof > 0 and 0.5 * shape > chi2_interval(dof, 0.998, 1)[1]:

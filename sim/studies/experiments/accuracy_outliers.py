@@ -1,6 +1,6 @@
-"""Compare maps with 30 % outliers with maps of the same inliers alone.
+"""Maps with 30 % outliers beside maps of the same inliers.
 
-An outlier has a uniform range and bearing, or the identity of another landmark.
+An outlier has a uniform range and bearing, or another identity.
 """
 
 import msgspec
@@ -44,7 +44,7 @@ SHOWN: Shown = (
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Figures by kind of outlier beside the clean runs."""
+    """Figures by kind of outlier."""
     figures: dict[str, dict[str, Figures]] = {}
     goals = []
     for world in WORLDS:

@@ -1,6 +1,6 @@
-"""Unknown initial poses: all robots but the first must be placed in the team's map.
+"""Unknown initial poses: all robots but the first must be placed.
 
-A merge is wrong if a joined robot's first pose lies outside its own 99.9 % ellipsoid.
+A merge is wrong if a first pose lies outside its own 99.9 % ellipsoid.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -29,7 +29,7 @@ SHOWN: Shown = (
 
 
 def is_wrong(chi2: float) -> bool:
-    """Whether χ² of a first pose exceeds the 99.9 % quantile."""
+    """Whether χ² exceeds the 99.9 % quantile."""
     return chi2 > chi2_limit(3, 0.001)
 
 

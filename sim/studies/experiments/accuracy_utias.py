@@ -1,4 +1,4 @@
-"""Real data: every given UTIAS set, five robots, one fixed profile.
+"""Real data: every given UTIAS set, one fixed profile.
 
 `shape`: the error after alignment; its NEES per landmark is 2 for a correct covariance.
 """

@@ -26,7 +26,7 @@ from teamslam.team.pairs import PAIRS
 
 
 class World(NamedTuple):
-    """Scenario, maximum seeds, and the goals of the default pair.
+    """Scenario, maximum seeds, and goals of the default pair.
 
     rules: every valid pair runs. batch: with the batch MAP.
     """
@@ -72,7 +72,7 @@ SHOWN: Shown = (
 
 
 def outcome(options: Options, results: Results) -> Outcome:
-    """Figures of all worlds and rules; the default rule's goals."""
+    """Figures of all worlds and rules."""
     worlds: dict[str, dict[str, Figures]] = {}
     goals: list[Goal] = []
     tables: list[Table] = []
@@ -88,7 +88,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
-    """Figures of each rule of one world, and of the batch.
+    """Figures of each rule, and of the batch.
 
     ratio: RMS landmark error over the batch's.
     """

@@ -36,7 +36,7 @@ RATIO, FEW = 20.0, 2
 
 
 class System(NamedTuple):
-    """An estimator and a rule; named: landmarks have identities."""
+    """Estimator and rule; named: landmarks have identities."""
 
     name: str
     estimator: Estimator
@@ -191,7 +191,7 @@ def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) 
 
 
 def draw_curves(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
-    """Six panels, with one colour per system."""
+    """Six panels, a colour per system."""
     shown = [each for each in FIGURES if each[0] not in ("wrong_percent", "gospa")]
     made = figure(12.0, 6.0)
     colours = {system.name: f"C{k}" for k, system in enumerate(SYSTEMS)}

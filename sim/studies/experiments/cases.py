@@ -1,4 +1,4 @@
-"""Compute cases in parallel and store their results by joblib; each case fails alone."""
+"""Compute cases in parallel and store their results by joblib."""
 
 import json
 import re
@@ -27,7 +27,7 @@ Cached = Callable[..., dict[str, Any]]
 
 @dataclass(frozen=True)
 class Done:
-    """A finished case: its result, or an error with traceback."""
+    """A finished case: result, or error with traceback."""
 
     task: Task
     result: dict[str, Any] | None
@@ -36,7 +36,7 @@ class Done:
 
 
 class Cases:
-    """Stored results of a folder, by parameters and program."""
+    """Stored results, by parameters and program."""
 
     def __init__(self, folder: Path) -> None:
         self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
@@ -53,7 +53,7 @@ class Cases:
         return result
 
     def run(self, tasks: Sequence[Task], jobs: int) -> Iterator[Done]:
-        """Compute the cases, `jobs` at a time, the longest first; yield each when done.
+        """Compute the cases, the longest first; yield each when done.
 
         Leaving the iterator ends the workers.
         """
@@ -181,7 +181,7 @@ def write_shard(folder: Path, shard: Shard, study: Study, programs: Mapping[str,
 
 
 def study_of(folders: Sequence[Path]) -> tuple[Study, dict[str, str]]:
-    """Study of these shards and its program; raises ShardError unless complete."""
+    """Study of these shards; raises ShardError unless complete."""
     described = {folder: _description(folder) for folder in folders}
     numbers = {folder: int(each.pop("shard")) for folder, each in described.items()}
     first, common = next(iter(described.items()))

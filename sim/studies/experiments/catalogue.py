@@ -1,4 +1,4 @@
-"""The experiments by name: what every start of `teamslam` reads of them."""
+"""The experiments by name."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,8 +8,7 @@ from typing import NamedTuple
 class Entry(NamedTuple):
     """Command, module, summary.
 
-    module: has `outcome`, or `module:object`. seeds: by default, with --quick, and at
-    most in `all`.
+    module: has `outcome`, or `module:object`. seeds: by default, with --quick, at most in `all`.
     """
 
     name: str
@@ -22,7 +21,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Study:
-    """An experiment's name, and the options that determine its runs."""
+    """Experiment and the options that determine its runs."""
 
     experiment: str
     seeds: int | None

@@ -1,6 +1,5 @@
-"""Compute a run's errors over team time: online poses, and the first landmark of robot 1.
-
-The landmark is the newest fused map's, or else the robot's own.
+"""Errors over team time: online poses, and robot 1's first landmark in the newest fused map, or
+else its own.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -62,7 +61,7 @@ def curves_run(
     late: bool = False,
     shots: Sequence[int] = (),
 ) -> Figures:
-    """Curves of poses and first landmark, the map's error, the map at `shots`."""
+    """Curves of poses and first landmark, the map at `shots`."""
     scenario = loads(msgspec.json.encode(world).decode())
     team = scenario if team_scenario is None else loads(msgspec.json.encode(team_scenario).decode())
     streams = streams_of(scenario)
@@ -95,7 +94,7 @@ def curves_run(
 def true_landmarks(
     samples: Iterable[Sample],
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Ids and positions [m] of the world's landmarks, if known."""
+    """Ids and positions [m] of landmarks."""
     for message in messages(samples, ch.TRUTH_LANDMARKS.key()):
         if isinstance(message, m.TruthLandmarks):
             return translate.landmarks_of(message)
@@ -132,7 +131,7 @@ def pose_keys(scenario: Scenario, robot: str) -> tuple[str, ...]:
 def estimated_poses(
     samples: Iterable[Sample], keys: Sequence[str]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
-    """Poses and covariances on these keys; later keys have precedence."""
+    """Poses and covariances; later keys have precedence."""
     by_stamp: dict[str, dict[int, m.PoseEstimate]] = {key: {} for key in keys}
     for sample in samples:
         if sample.key in by_stamp:

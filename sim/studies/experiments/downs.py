@@ -1,4 +1,4 @@
-"""Tables 5.1 … 5.5 of J. Downs' thesis on map joining, on every given UTIAS set.
+"""Tables 5.1 … 5.5 of J. Downs' thesis, on every given UTIAS set.
 
 Printed figures, his protocol (`downs_joined`) and ours (`utias`), with the profile's models.
 """
@@ -101,7 +101,7 @@ TEAM = "team"
 
 
 class Method(NamedTuple):
-    """Row of a table: name, and a figure per robot or of the team."""
+    """Row: name, and a figure per robot or of the team."""
 
     name: str
     row: Callable[[Options, Dataset, Results], Row]
@@ -109,7 +109,7 @@ class Method(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """A paired t-test: its text, its printed p, and its two sides by set.
+    """Paired t-test: text, printed p, two sides by set.
 
     before: the other table's row by method.
     """
@@ -121,9 +121,9 @@ class Compared(NamedTuple):
 
 
 class PrintedTable(NamedTuple):
-    """Table of the thesis. printed: figures of each column by set number.
+    """Table of the thesis. printed: figures by set number.
 
-    sample: run whose map on the first set is drawn, as in figure 5.1.
+    sample: run whose map is drawn, as in figure 5.1.
     """
 
     title: str

@@ -1,8 +1,7 @@
-"""Runs after J. Downs' thesis: whole-run maps of each robot, and submaps joined by his method.
+"""Runs after J. Downs' thesis: whole-run maps, and submaps joined by his method.
 
-Measurements and submaps of one second; a robot's submaps are joined with the identity, the maps
-aligned by singular values (`svd-join-spherical`). A submap is a window of the hybrid estimator;
-his is an EKF step.
+Measurements and submaps of one second, joined with the identity and aligned by singular values
+(`svd-join-spherical`). A submap is a window of the hybrid estimator; his is an EKF step.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,7 +62,7 @@ def final_maps_only(scenario: Scenario) -> Scenario:
 
 
 def his_protocol(scenario: Scenario) -> Scenario:
-    """Set his protocol: steps of one second, exact initial poses, no loss or factor."""
+    """Set steps of one second, exact initial poses, no loss or factor."""
     change = msgspec.structs.replace
     scenario = final_maps_only(scenario)
     if isinstance(scenario.world, UtiasWorld):
@@ -92,7 +91,7 @@ def _task(work: str, scenario: Scenario, dataset: Dataset | None, note: str) -> 
 
 
 def whole_run(scenario: Mapping[str, Any], sha256: str = "", path: str | None = None) -> Figures:
-    """Errors of the robots' last maps and online paths; one map."""
+    """Errors of the robots' last maps and online paths."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     return {
@@ -128,10 +127,7 @@ def _thin(path: Path) -> list[list[float]]:
 def spherical_run(
     scenario: Mapping[str, Any], sha256: str = "", path: str | None = None
 ) -> Figures:
-    """Errors of robots' joined maps and smoothed paths, and of the team.
-
-    with_covariances: joined with the submaps' covariances.
-    """
+    """Errors of joined maps and smoothed paths, and of the team."""
     samples = _samples(scenario, path)
     evaluation = evaluate(samples)
     ids, positions = true_landmarks(samples)
@@ -215,7 +211,7 @@ def _path_error(evaluation: Evaluation, robot: str, path: Path) -> float | None:
 def _mutual(
     samples: Sequence[Sample], sensors: Mapping[str, Sensor], paths: Mapping[str, Path]
 ) -> dict[tuple[Stream, Stream], PointPairs]:
-    """Positions in both maps of robots that measured each other in one step."""
+    """Positions in both maps of robots that measured each other."""
     looks = {name: _looks(samples, name, sensors[name]) for name in paths}
     found: dict[tuple[Stream, Stream], PointPairs] = {}
     for a in sorted(paths):

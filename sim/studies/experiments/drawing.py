@@ -18,9 +18,9 @@ BAND = (0.1, 0.9)
 
 @dataclass(frozen=True)
 class Curves:
-    """Errors and sigmas of S runs at K common times; NaN before a run's first value.
+    """Errors and sigmas of S runs at K times; NaN before a first value.
 
-    nees: mean per degree of freedom of each run, if any.
+    nees: mean per degree of freedom.
     """
 
     times_s: Float[np.ndarray, " K"]
@@ -61,7 +61,7 @@ class Curves:
 def sample_curve(
     times_s: Float[np.ndarray, " K"], run: Mapping[str, Any], name: str, *, stepwise: bool
 ) -> Float[np.ndarray, " K"]:
-    """Sample a curve at these times; stepwise: hold values, no interpolation."""
+    """Sample a curve; stepwise: hold values."""
     stamps, values = np.array(run["time_s"]), np.array(run[name])
     if not len(stamps):
         return np.full(len(times_s), np.nan)
@@ -96,7 +96,7 @@ def draw_map(
     colour: str = MAP_COLOUR,
     label: str | None = None,
 ) -> None:
-    """Draw landmarks as dots with 95 % ellipses. blocks: 2 × 2 covariances [m²]."""
+    """Draw landmarks with 95 % ellipses. blocks: 2 × 2 covariances [m²]."""
     dots = np.array(means, dtype=np.float64).reshape(-1, 2)
     axis.plot(*dots.T, linestyle="", marker=".", color=colour, zorder=5, label=label)
     draw_ellipses(axis, dots, np.array(blocks).reshape(-1, 2, 2), colour, zorder=5)

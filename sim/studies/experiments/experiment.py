@@ -16,7 +16,7 @@ UTIAS_SOURCE = (
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set; sha256 of its file, or of all files of its folder."""
+    """Data set; sha256 of its file, or all files of its folder."""
 
     name: str
     path: Path
@@ -24,7 +24,7 @@ class Dataset:
 
 
 def seed_count(count: int) -> str:
-    """A number with its noun: `1 seed`, `3 seeds`."""
+    """Number with noun: `1 seed`, `3 seeds`."""
     return f"{count} seed{'' if count == 1 else 's'}"
 
 
@@ -44,7 +44,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Results:
-    """Results by task name, without failed runs. asked: the tasks asked for, by name."""
+    """Results by task name, without failed runs; asked: tasks by name."""
 
     by_name: Mapping[str, dict[str, Any]]
     asked: dict[str, Task] = field(default_factory=dict)
@@ -99,8 +99,7 @@ class Goal:
 class Outcome:
     """Result of an experiment.
 
-    remarks: differences from the source, with the reason. missing: figures that need more data,
-    with the remedy.
+    remarks: differences from the source. missing: figures that need more data.
     """
 
     title: str
@@ -117,14 +116,14 @@ class Experiment(Protocol):
     """Interface of an experiment's module."""
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """The outcome of the results.
+        """Outcome of the results.
 
-        It asks for the same runs whatever their results are, none at first.
+        It asks for the same runs whatever the results are, none at first.
         """
 
 
 def runs_of(experiment: Experiment, options: Options) -> tuple[Task, ...]:
-    """The runs that an experiment's outcome asks for, each once."""
+    """Runs that an outcome asks for."""
     results = Results({})
     experiment.outcome(options, results)
     return tuple(results.asked.values())

@@ -1,8 +1,7 @@
-"""Common part of the experiments after K.-C. Ma and Z. Ma's report: runs on a UTIAS set.
+"""Runs after K.-C. Ma and Z. Ma's report, on a UTIAS set.
 
-Parameters of its program: robot 1's initial pose is that of set 2, α₁ … α₆ are 0.1 for intervals
-of 0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad², odometry is
-uncalibrated.
+Parameters of its program: robot 1's initial pose is that of set 2, α₁ … α₆ are 0.1 for intervals of
+0.02 s, the variances of range and bearing 0.0167 m² and 0.000737 rad², odometry is uncalibrated.
 """
 
 from collections.abc import Mapping
@@ -95,7 +94,7 @@ def _as_in_the_program(robot: RobotConfig) -> RobotConfig:
 
 
 def ma_run(scenario: Mapping[str, Any], sha256: str, path: str) -> Figures:
-    """Errors over frames of paths and map, the lines and the last map."""
+    """Errors over frames of paths and map, and the last map."""
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     samples = list(TimedRun().samples(resolved))
     evaluation = evaluate(samples)

@@ -49,7 +49,7 @@ class ErrorFigure(NamedTuple):
     remarks: tuple[str, ...]
 
     def outcome(self, options: Options, results: Results) -> Outcome:
-        """Medians and bands beside the printed figures, for each set."""
+        """Medians and bands beside the printed figures."""
         if not options.datasets:
             return Outcome(self.title, {}, missing=(without_datasets(self.title),))
         figures, rows, pictures = {}, [], []
@@ -185,7 +185,7 @@ CLOUD_COLOUR = SKY
 
 
 class PathFigure(NamedTuple):
-    """Paths of some methods side by side, of the first seed."""
+    """Paths of some methods side by side."""
 
     title: str
     methods: tuple[Method, ...]

@@ -1,4 +1,4 @@
-"""Show the progress of runs; write an outcome: tables, JSON, pictures, and a page."""
+"""Show the progress of runs; write tables, JSON, pictures, and a page."""
 
 import base64
 import json

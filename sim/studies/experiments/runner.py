@@ -35,7 +35,7 @@ COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central
 
 
 def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
-    """Label, number and parameters of runs that differ only in seed."""
+    """Label, number and parameters of runs that differ in seed only."""
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
         label = task.label.rpartition(", seed ")[0] or task.label
@@ -87,9 +87,9 @@ FAILURES = "failures.txt"
 
 @dataclass(frozen=True)
 class Concluded:
-    """An experiment's outcome, and its failed runs with errors.
+    """Outcome, and failed runs with errors.
 
-    kinds: label, number and parameters of runs that differ only in seed.
+    kinds: see `kinds_of`.
     """
 
     entry: Entry
@@ -185,7 +185,7 @@ def _write_failures(path: Path, failures: Sequence["Done"]) -> None:
 
 
 def dataset(path: Path) -> Dataset:
-    """Open a data set with its checksum; raises DatasetError."""
+    """Data set with its checksum."""
     with open_data_set(str(path), "Barcodes.dat"):
         pass
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())

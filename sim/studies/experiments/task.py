@@ -22,7 +22,7 @@ _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 
 
 def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
-    """Text of a module and of all that it imports of these packages, transitively.
+    """Text of a module and of all that it imports of these packages.
 
     Names in tables (`teamslam.team.registry`) count as imports.
     """
@@ -43,7 +43,7 @@ def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
 
 @lru_cache
 def _imported(source: bytes) -> tuple[str, ...]:
-    """Modules that a source may use: `from a import b` or a text `a.b:c`."""
+    """Modules that a source may use: `from a import b` or `a.b:c`."""
     names: list[str] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -76,9 +76,9 @@ LIBRARIES = ("numpy", "scipy", "gtsam")
 
 @dataclass(frozen=True)
 class Task:
-    """One run. work: `module:function`, from the parameters to a JSON object.
+    """One run. work: `module:function`, from parameters to a JSON object.
 
-    local: arguments without influence on the result. cost: estimated run time [s].
+    local: arguments without influence on the result. cost: estimated time [s].
     """
 
     work: str

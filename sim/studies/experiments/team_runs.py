@@ -50,7 +50,7 @@ def team_task(
 ) -> Task:
     """Make the task of a team's run.
 
-    batch: with the batch MAP of this noise. minimum: with `true_minimum`. note: part of the label.
+    batch: with the batch MAP of this noise. minimum: with `true_minimum`.
     """
     pair = pair_name(scenario.estimator, scenario.fusion)
     place = scenario.name if dataset is None else dataset.name
@@ -130,7 +130,7 @@ def team_run(
     sha256: str = "",
     path: str | None = None,
 ) -> Figures:
-    """Figures of one run, with `batch` and `minimum` as in `team_task`."""
+    """Figures of one run, as in `team_task`."""
     resolved = with_options(loads(msgspec.json.encode(scenario).decode()), dataset=path)
     run = TimedRun()
     # Provisional maps and priors are the bulk of a large team's log and not used here.
@@ -152,7 +152,7 @@ def team_run(
 
 
 class TimedRun:
-    """A team in memory, and the CPU time [s] of its robots and centre."""
+    """Team in memory, and CPU time [s] of robots and centre."""
 
     def __init__(self) -> None:
         self._robots = _Watch()
@@ -170,7 +170,7 @@ class TimedRun:
             yield sample
 
     def figures(self) -> Figures:
-        """Times in total, per odometry interval and per fused map."""
+        """Times in total, per interval and per fused map."""
         return {
             "robot_seconds": self._robots.seconds,
             "centre_seconds": self._centre.seconds,
@@ -217,10 +217,7 @@ class _Watch:
 
 
 def team_figures(evaluation: Evaluation) -> Figures:
-    """Figures of a run, averaged over the robots; None without truth.
-
-    Without a fused map those of the robots' own maps.
-    """
+    """Figures averaged over the robots; without a fused map of the robots' own."""
     robots = list(evaluation.robots.values())
     fused = evaluation.map
     own = [robot.own_map for robot in robots if robot.own_map is not None]
@@ -328,13 +325,13 @@ def over_seeds(runs: Sequence[Figures]) -> Figures:
 def table_of(
     title: str, first: str, figures: Mapping[str, Figures], shown: Shown, note: str = ""
 ) -> Table:
-    """Table with a row for each set of figures; first: heading of names."""
+    """Table with a row for each set of figures."""
     rows = tuple((name, *cells_of(of_row, shown)) for name, of_row in figures.items())
     return Table(title, (first, *(heading for _, heading, _ in shown)), rows, note)
 
 
 def cells_of(figures: Figures, shown: Shown) -> list[str]:
-    """A row of a table; a dash for a missing figure."""
+    """Row of a table."""
     return [
         "–" if figures.get(name) is None else form.format(figures[name]) for name, _, form in shown
     ]

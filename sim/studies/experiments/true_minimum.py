@@ -1,8 +1,7 @@
-"""Decide by the cost, not the covariance, whether map and truth lie in the same minimum.
+"""Decide by the cost whether map and truth lie in the same minimum.
 
-By `plain_cost`: whether a solution from the truth has less cost, or ends elsewhere about as
-likely, and the rise of the cost with the truth fixed (likelihood ratio, χ² of the fixed
-coordinates).
+Whether a solution from the truth has less cost, or ends elsewhere about as likely, and the rise of
+the cost with the truth fixed (likelihood ratio, χ² of the fixed coordinates).
 """
 
 from collections import defaultdict
@@ -55,7 +54,7 @@ class Solution(NamedTuple):
 
 
 class Whitened(NamedTuple):
-    """Whitened residuals of K terms of a kind, Jacobians and state indices."""
+    """Whitened residuals of K terms, Jacobians and state indices."""
 
     residuals: Float[np.ndarray, "K r"]
     jacobians: Float[np.ndarray, "K r m"]
@@ -137,9 +136,8 @@ class PlainCost:
 
 
 class _Submaps(NamedTuple):
-    """K submaps of equal size.
-
-    at: state indices of each start, poses and landmarks; points: the first ones of the latter two.
+    """K submaps of equal size; at: state indices of start, poses and landmarks; points: first
+    indices of the latter two.
     """
 
     whitening: Float[np.ndarray, "K n n"]
@@ -169,7 +167,7 @@ class _Submaps(NamedTuple):
 
 
 class _Sightings(NamedTuple):
-    """K inter-robot measurements. at: coordinates of the two poses, observer first."""
+    """K inter-robot measurements; at: coordinates of observer and observed."""
 
     whitening: Float[np.ndarray, "K 2 2"]
     means: Float[np.ndarray, "K 2"]
@@ -273,11 +271,11 @@ NEARBY_RAD = 0.1
 
 
 class TrueMinimum(NamedTuple):
-    """The map's minimum compared with that of a solution from the truth.
+    """The map's minimum beside that of a solution from the truth.
 
     lower: by how much the latter's cost is less. other_minimum: it ends outside the map's 99.9 %
     ellipsoid, at a cost that does not exclude it. rise: of the cost with landmarks and first
-    submaps' ends fixed at the truth; dof: number of these coordinates.
+    submaps' ends fixed at the truth; dof: of these.
     """
 
     lower: float
@@ -312,7 +310,7 @@ def true_minimum(samples: Iterable[Sample], run: Evaluation) -> TrueMinimum | No
 def final_fold(
     samples: Iterable[Sample], *, is_robust: bool = False, has_biases: bool = False
 ) -> Fold:
-    """Recompute the final fold, by default with plain squares and no biases."""
+    """Recompute the final fold, by default with plain squares."""
     log = Recorded()
     for sample in samples:
         log.take(sample)
@@ -339,7 +337,7 @@ def compare_minima(
     landmarks: Mapping[int, Float[np.ndarray, "2"]],
     paths: Mapping[str, Path],
 ) -> TrueMinimum:
-    """Figures of an island in the truth's frame, with plain squares and no biases."""
+    """Figures of an island in the truth's frame."""
     graph, settings = island.graph, island.settings
     if settings.robust:
         raise NotImplementedError("this cost has plain squares, without a robust loss")

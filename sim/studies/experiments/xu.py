@@ -1,7 +1,7 @@
-"""Common part of the experiments after W. Xu's thesis: its world, its methods, its curves.
+"""Common part of the experiments after W. Xu's thesis.
 
-The scenario `thesis` with the 50 particles of section 4.4.2: the median of many seeds with the 10
-… 90 % band, and one run with its 3σ bound; a figure of the thesis is one run.
+The scenario `thesis` with the 50 particles of section 4.4.2: the median of many seeds with the 10 …
+90 % band, and one run with its 3σ bound; a figure of the thesis is one run.
 """
 
 import math
@@ -32,9 +32,9 @@ CODED_BEARING_SIGMA = math.sqrt(math.pi / 18.0**2)
 
 
 class Method(NamedTuple):
-    """A curve of a figure: name, pair, number of robots, colour.
+    """Curve: name, pair, number of robots, colour.
 
-    particles: 50, as in the thesis; None: the scenario's.
+    particles: None: the scenario's.
     """
 
     name: str
@@ -62,11 +62,10 @@ Reading = Literal["stated", "exact", "coded"]
 
 
 class Panel(NamedTuple):
-    """One world of a figure, its methods, and the thesis' figures in metres.
+    """World of a figure, its methods, the thesis' figures [m].
 
     noise: of the odometry, (m, rad) in a step. reading: "stated": the text; "exact": exact
-    odometry, while the filters assume noise; "coded": `as_coded`. printed: largest error by
-    method.
+    odometry, while the filters assume noise; "coded": `as_coded`. printed: largest error by method.
     """
 
     name: str
@@ -164,10 +163,9 @@ def _tell_every_step(scenario: Scenario) -> Scenario:
 def as_coded(scenario: Scenario) -> Scenario:
     """Set the inputs of the appendix' program where they differ from section 4.4.2.
 
-    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` in `add_control_noise` are variances used as standard
-    deviations: 2.5 mm and 0.16°. `R(2,2) = pi/18^2` is a variance: 5.6°, not 10°. Landmarks are
-    detected within 20 m. `get_observations(xtrue(:,i), …)` measures from the pose before the
-    motion.
+    `rv = (0.05)^2` and `rg = (3.0*pi/180)^2` are variances used as standard deviations: 2.5 mm and
+    0.16°. `R(2,2) = pi/18^2` is a variance: 5.6°, not 10°. Landmarks are detected within 20 m.
+    `get_observations(xtrue(:,i), …)` measures from the pose before the motion.
     """
     coded = with_world(scenario, visible_from_m=0.0, observe_at_start=True)
     return with_noise(with_robots(coded, "sensor", bearing_sigma=CODED_BEARING_SIGMA), *CODED_NOISE)
@@ -181,7 +179,7 @@ def with_particles(scenario: Scenario, particles: int) -> Scenario:
 
 
 def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
-    """Set the odometry noise (m, rad) of a step of a second."""
+    """Set the odometry noise (m, rad) of a step."""
     noise = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
     return with_robots(scenario, "motion", **noise)
 

@@ -1,7 +1,7 @@
-"""Section 3.5 of W. Xu's thesis: a particle filter localises a robot on a known map.
+"""Section 3.5 of W. Xu's thesis: a particle filter localises on a known map.
 
-As figures 3.2 to 3.5 (Fox et al. 2000), on the thesis' world: the filter's three steps after a
-stretch without measurements, and an unknown start.
+As figures 3.2 to 3.5 (Fox et al. 2000): the filter's three steps after a stretch without
+measurements, and an unknown start.
 """
 
 from collections.abc import Mapping
@@ -257,7 +257,7 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
 
 
 def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
-    """Localise from a uniform cloud, by each step's farthest measurement."""
+    """Localise from a uniform cloud."""
     run = _run_of(world)
     config = run.scenario.robots[0]
     assert isinstance(run.scenario.world, SimulatedWorld)

@@ -51,7 +51,7 @@ STEPS = 500
 
 
 class MapFigure(NamedTuple):
-    """Maps of methods at some steps of one run, and the error over seeds.
+    """Maps at some steps of one run, and the error over seeds.
 
     shown: methods with their reading.
     """

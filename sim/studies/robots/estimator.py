@@ -22,7 +22,7 @@ from teamslam.team.shapes import Float, UInt32
 
 
 class KnownMap(NamedTuple):
-    """Prior map of a localising robot: ids ascending, positions [m] in the team's frame."""
+    """Prior map: ids ascending, positions [m] in the team's frame."""
 
     ids: UInt32[np.ndarray, " L"]
     landmarks: Float[np.ndarray, "L 2"]
@@ -32,10 +32,10 @@ NOTHING_KNOWN = KnownMap(np.empty(0, np.uint32), np.empty((0, 2)))
 
 
 class Estimates(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """Results of an odometry interval: stamps of a new running pose and map.
+    """Results of an odometry interval: stamps of a new pose and map.
 
-    cloud: the particles. judged: the innovation since its last report, and its time. became:
-    outcomes of the stream's detections without identities, at its end.
+    judged: the innovation since its last report, and its time. became: outcomes of detections
+    without identities, at the end.
     """
 
     pose_ns: int | None = None
@@ -50,10 +50,10 @@ NOTHING_NEW = Estimates()
 
 @runtime_checkable
 class RobotEstimator(Protocol):
-    """Estimator on one incarnation of a robot's stream.
+    """Estimator on one incarnation.
 
-    sequence: number of its poses and maps. used: disposition of its measurements. joint: the map
-    has a joint covariance. innovation: of all predicted measurements.
+    sequence: number of poses and maps. used: disposition of its measurements. joint: the map has a
+    joint covariance.
     """
 
     @property

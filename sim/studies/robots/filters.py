@@ -40,10 +40,7 @@ S = TypeVar("S")
 
 
 def _with_association(plain: Filter) -> Filter:
-    """Use identities until the first scan without, none later.
-
-    Particles keep their poses; landmarks mapped by identity are dropped.
-    """
+    """Use identities until the first scan without; then drop landmarks mapped by identity."""
 
     def filter_step(
         state: PlainFastSlam | FastSlamMl, step: RobotStep, generator: np.random.Generator
@@ -149,9 +146,8 @@ def _plain(proposal: Proposal) -> Filter:
 def _localisation_initial_state(
     config: RobotConfig, initial: InitialPose, known: KnownMap, generator: np.random.Generator
 ) -> Localisation:
-    """Draw an unknown initial pose in the known map's box, widened by the sensor's reach.
-
-    The reach counts at most half the box's longer side.
+    """Draw a pose in the known map's box, widened by the sensor's reach, at most half its longer
+    side.
     """
     front = config.front_end
     landmarks = known.landmarks

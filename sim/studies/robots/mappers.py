@@ -37,8 +37,8 @@ JOINT_LANDMARKS = 2000
 class MapExchange:
     """Rounds of one robot.
 
-    exchanges: the rule fuses own maps. lockstep: the robot waits for answers. answered, awaited:
-    last answered and last sent round. last: its sequence; −1: none.
+    lockstep: the robot waits for answers. answered, awaited: last answered and last sent round.
+    last: its sequence; −1: none.
     """
 
     def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
@@ -57,7 +57,7 @@ class MapExchange:
         return self.lockstep and self.awaited > self.answered
 
     def take_answer(self, round_: int) -> bool:
-        """Record the answer of a round; return whether it is new."""
+        """Record an answer; return whether it is new."""
         if not self.lockstep or round_ <= self.answered:
             return False
         self.answered = round_
@@ -84,7 +84,7 @@ class MapExchange:
         *,
         joint: bool,
     ) -> Outgoing:
-        """Make a map's message; an exchanged one opens a round."""
+        """Make a map's message, which may open a round."""
         if self.exchanges:
             self._sent_ns, self.last = stamp_ns, sequence
             self.awaited = self.answered + 1 if self.lockstep else self.awaited
@@ -98,10 +98,7 @@ class MapExchange:
 
 
 class ExchangingMapper(Mapper):
-    """Hybrid-SLAM that sends its own map in exchanges, or only to viewers.
-
-    joint: with a joint covariance.
-    """
+    """Hybrid-SLAM that sends its own map in exchanges, or to viewers."""
 
     joint = True
 
@@ -149,7 +146,7 @@ class ExchangingMapper(Mapper):
 
 
 class StreamMapper(ExchangingMapper):
-    """An estimator with one state over a stream, also after a fault; no submaps."""
+    """Estimator with one state over a stream; no submaps."""
 
     def __init__(self, config: RobotConfig, *options: Any) -> None:
         self._known: KnownMap | None = None if config.estimator in NEEDS_MAP else NOTHING_KNOWN
@@ -172,7 +169,7 @@ class StreamMapper(ExchangingMapper):
         return self._known is None
 
     def know(self, message: m.KnownMap) -> None:
-        """Store the known map; the newer stamp wins, far landmarks are dropped."""
+        """Store the newest known map without far landmarks."""
         if self._known_ns is not None and message.stamp_ns <= self._known_ns:
             return
         self._known_ns = message.stamp_ns

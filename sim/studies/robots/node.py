@@ -1,4 +1,4 @@
-"""Node of a comparison robot: its centre fuses whole maps or raw measurements.
+"""Node of a comparison robot, whose centre fuses whole maps or raw measurements.
 
 Under a rule with feedback the robot waits for the fused map of each exchange and absorbs it.
 """
@@ -59,15 +59,14 @@ class ExchangingRobot(RobotNode):
 
     @property
     def is_held(self) -> bool:
-        """Whether the robot waits for a known map, or for a centre that is present.
-
-        A centre that was never present may still answer.
+        """Whether it waits for a known map, or for a centre, which may still answer if it was never
+        present.
         """
         waits = self.mapper.exchange.waits and not self._centre_is_away
         return self.mapper.waits_for_map or waits
 
     def consume(self) -> None:
-        """Consume the measurements in order; a waiting robot reports those received."""
+        """Consume in order; a waiting robot reports what it received."""
         super().consume()
         if not self.mapper.exchange.lockstep or not self.is_held:
             return

@@ -35,8 +35,7 @@ from teamslam.team.robot.maps import Cloud, InitialPose, thin_out
 class RunningEstimator:
     """State after every keyframe; its map is published once per window, or at every keyframe.
 
-    sequence: number of keyframes. associates: accepts scans without identities, with outcomes at
-    the end.
+    sequence: number of keyframes. associates: accepts scans without identities.
     """
 
     def __init__(
@@ -181,7 +180,7 @@ class RunningEstimator:
         return (state, judged) if finite else None
 
     def finish(self) -> tuple[Estimates, int]:
-        """End the stream; return the last keyframe and map, and the unused scans."""
+        """End the stream; return last keyframe and map, and unused scans."""
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:

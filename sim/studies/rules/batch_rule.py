@@ -28,9 +28,9 @@ FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
 
 
 class BatchCentre(MeasurementCentre):
-    """All poses at the robots' keyframes and all landmarks, solved anew at each broadcast.
+    """All keyframes and landmarks, solved anew at each broadcast.
 
-    Persistent sensor errors and biases are treated as white noise, with a warning.
+    Persistent errors and biases are treated as white noise, with a warning.
     """
 
     _batch: GrowingBatch

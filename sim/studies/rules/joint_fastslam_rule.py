@@ -21,7 +21,7 @@ RESAMPLE_BELOW = 1.0
 
 
 class JointFastSlamCentre(MeasurementCentre):
-    """One particle filter over all robots' paths and one map, by FastSLAM 1.0."""
+    """One particle filter over all paths and one map, by FastSLAM 1.0."""
 
     _state: JointFastSlam
 

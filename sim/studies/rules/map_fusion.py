@@ -1,7 +1,6 @@
-"""Fusion of whole maps that the robots then absorb, for comparison.
+"""Fusion of whole maps that the robots then absorb.
 
-The Kalman rules treat the maps as independent, which they are not after an exchange; covariance
-intersection is consistent for any correlation.
+The Kalman rules treat maps as independent, which they are not after an exchange.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +30,7 @@ SMALLEST_VARIANCE = 1e-12
 
 
 def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
-    """Full-covariance Kalman fusion in the given order, as if the maps were independent.
+    """Full-covariance Kalman fusion in the given order.
 
     K = A_·c (A_cc + B_cc)⁻¹ on the common landmarks c, Joseph's form; B's others by regression on
     c.
@@ -40,7 +39,7 @@ def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 
 
 def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
-    """The thesis' fusion: each coordinate by itself, without correlations (Xu, eq. 5.1-5.4).
+    """Fuse each coordinate by itself (Xu, eq. 5.1-5.4).
 
     TH = TH^A + S^A/(S^A + S^B) (TH^B − TH^A) (the printed sign of 5.1 and 5.3 is a slip) and S =
     S^A S^B/(S^A + S^B).
@@ -49,10 +48,10 @@ def kalman_per_axis(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
 
 
 def covariance_intersection(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:
-    """Fusion that is consistent for any correlation of the maps (Julier & Uhlmann 1997).
+    """Fusion consistent for any correlation (Julier & Uhlmann 1997).
 
     On the common landmarks C⁻¹ = ω A⁻¹ + (1 − ω) B⁻¹ and m = C (ω A⁻¹a + (1 − ω) B⁻¹b), with the ω
-    of the least determinant of C. The others follow by regression in their own map.
+    of the least determinant of C. The others follow by regression.
     """
     return _one_by_one(_intersect_pair, maps)
 
@@ -74,10 +73,7 @@ def fuse_maps(
     maps: Mapping[str, LandmarkGaussian],
     coordinate_m: float,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """Fuse the robots' maps; return the result and rejected maps with reasons.
-
-    Rejected: beyond the bounds, or without a result.
-    """
+    """Fuse maps; return the result and rejected maps with reasons."""
     accepted: dict[str, LandmarkGaussian] = {}
     reasons = []
     for robot, each in maps.items():

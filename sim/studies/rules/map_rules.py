@@ -1,7 +1,7 @@
 """Rules that fuse whole maps which the robots absorb, in lockstep.
 
-The fused map replaces the robots' landmarks, so under `kalman` and `kalman-per-axis` measurements
-are counted repeatedly, and the covariance has no meaning.
+Under `kalman` and `kalman-per-axis` measurements are counted repeatedly, and the covariance has no
+meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -82,7 +82,7 @@ Starts = Mapping[Stream, m.InitialPose]
 class NewestMapsCentre(ComparisonCentre):
     """Newest map of every robot, and initial poses.
 
-    names_inputs: a map follows from its named maps alone.
+    names_inputs: a map follows from its named maps.
     """
 
     inputs = (ch.START, ch.OWN_MAP)
@@ -148,7 +148,7 @@ class NewestMapsCentre(ComparisonCentre):
 
 
 class LatestCentre(NewestMapsCentre):
-    """Latest map of every robot as one, without feedback, for known initial poses."""
+    """Latest map of every robot, for known initial poses."""
 
     names_inputs = False
 
@@ -199,7 +199,7 @@ class AloneCentre(NewestMapsCentre):
     """No fusion: a final map for single-robot teams only."""
 
     def fuse(self, maps: Maps, starts: Starts, now_ns: int, *, final: bool) -> m.FusedMap:
-        """The map of a single robot; for several an empty map, with the reason."""
+        """Map of a single robot; for several empty, with the reason."""
         reason = ""
         if not maps:
             reason = "no fusion, and this estimator makes no map"
@@ -256,7 +256,7 @@ _NOT_VALID = "this rule counts measurements more than once: its covariance is no
 
 
 class RoundsCentre(ComparisonCentre):
-    """Fusion of each round's maps in the order of names; stores submaps for restarted robots."""
+    """Fusion of each round's maps in order of names; stores submaps for restarted robots."""
 
     inputs = (ch.START, ch.SUBMAP, ch.OWN_MAP)
 
@@ -278,7 +278,7 @@ class RoundsCentre(ComparisonCentre):
         return []
 
     def publish_due(self) -> list[Outgoing]:
-        """Make the map of every complete round, after a restart from the present one on."""
+        """Make the map of every complete round."""
         later = min(self._rounds, default=self._next)
         if self._is_complete(later):
             self._next = later

@@ -39,7 +39,7 @@ class MapContent:
 
 
 class MeasurementCentre(ComparisonCentre):
-    """Estimate over all robots' raw measurements at the centre.
+    """Estimate over all raw measurements at the centre.
 
     The keyframes of one team time are one step, the clock of the maps. Robots with an unknown
     initial pose are left out; if none is known the first robot's is the frame. Members name the
@@ -63,7 +63,7 @@ class MeasurementCentre(ComparisonCentre):
 
     @abstractmethod
     def _start(self, starts: Mapping[str, tuple[Pose, Matrix | None]]) -> None:
-        """Begin with the robots' initial poses; covariances in (x, y, θ), None: exact."""
+        """Begin with initial poses; covariances in (x, y, θ), None: exact."""
 
     @abstractmethod
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
@@ -104,7 +104,7 @@ class MeasurementCentre(ComparisonCentre):
         return [] if self.finished else self._keyframes.requests(self.attendance.now_ns)
 
     def publish_due(self) -> list[Outgoing]:
-        """Process the complete steps, with a map every broadcast_s of team time."""
+        """Process complete steps, with a map every broadcast_s."""
         if not self.models and not self._begin():
             return []
         out: list[Outgoing] = []

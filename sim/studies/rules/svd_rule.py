@@ -42,7 +42,7 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """Submaps of a stream so far: number, map, digest of the inputs.
+    """Submaps of a stream so far.
 
     refused: the submap that ended the chain, with the reason.
     """
@@ -54,10 +54,7 @@ class _Joined:
 
 
 class SvdFold(SubmapFold):
-    """`svd-join` with the submaps' covariances, `svd-join-spherical` with the identity.
-
-    A later incarnation is a stream in its own frame.
-    """
+    """`svd-join` with the submaps' covariances, `svd-join-spherical` with the identity."""
 
     def __init__(
         self,
@@ -187,11 +184,10 @@ def align_maps(
     full: bool,
     sightings: Mapping[tuple[Stream, Stream], PointPairs] = NO_SIGHTINGS,
 ) -> tuple[LandmarkGaussian, tuple[str, ...]]:
-    """Align greedily the map with the most landmarks in common with the aligned ones.
+    """Align greedily the map with the most landmarks in common.
 
-    sightings: by two streams in order, positions in both maps of robots that measured each other;
-    like common landmarks, but not with `full`. A map with too few common points is left out, with
-    the reason.
+    sightings: positions, in both maps, of robots that measured each other, by two streams in order;
+    not with `full`. A map with too few common points is left out, with the reason.
     """
     fused = maps.get(first, NO_LANDMARKS)
     frames = {first: np.zeros(3)}

@@ -16,7 +16,7 @@ from teamslam.team.wire import messages as m
 
 
 class RobotKeyframe(NamedTuple):
-    """One robot's motion and final measurements; number: of the closing measurement."""
+    """Motion and final measurements; number: of the last one."""
 
     stamp_ns: int
     robot: str
@@ -26,9 +26,9 @@ class RobotKeyframe(NamedTuple):
 
 @dataclass
 class _Stream:
-    """Measurements of one robot, from its initial pose on.
+    """Measurements from the initial pose (measurement 0) on.
 
-    covered_ns: no keyframe before this team time can follow. start: measurement 0.
+    covered_ns: no keyframe before this time can follow.
     """
 
     robot: str
@@ -92,7 +92,7 @@ class _Stream:
 
 
 class TeamKeyframes:
-    """Keyframes of the team by (stamp, robot), as far as every robot's stream is known.
+    """Keyframes of the team by (stamp, robot), as far as every stream is known.
 
     A stream ends where it restarts at an unknown pose; inter-robot measurements are not used.
     """
