@@ -6,12 +6,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.diagnosis import describe, to_object
-from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import streams_of
@@ -20,6 +18,7 @@ from teamslam.team.estimation.map_joining.marginals import landmark_map
 from teamslam.team.estimation.map_joining.minima import MISFIT
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
+from tests.commands import run
 from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import Burst, CarriedOff, MovedLandmark, StressWorld, write
 
@@ -168,7 +167,7 @@ def test_points_in_the_axes_of_the_world_fail_the_run_and_name_their_frame(tmp_p
         rows = zip(seen[:, 0], seen[:, 1].astype(int), x, y, strict=True)
         lines = ["t_s,landmark,x_m,y_m", *(f"{a!s},{b},{c!s},{d!s}" for a, b, c, d in rows)]
         (robot / "observations.csv").write_text("\n".join(lines) + "\n")
-    result = CliRunner().invoke(app, ["rerun", str(place)])
+    result = run("rerun", place)
     assert result.exit_code == 1, result.output
     *_, error = result.stderr.splitlines()
     assert "the measurements contradict each other far beyond the stated noise" in error

@@ -423,13 +423,17 @@ def hidden(seed, moved=()):
     return day_of, streams_of(day_of)
 
 
-@pytest.mark.parametrize(("number", "by"), [(15, (1.0, -0.5)), (8, (0.6, 0.3))])
-def test_a_landmark_without_identity_that_has_moved_is_found_and_nothing_else(number, by):
+@cache
+def hidden_site() -> m.SavedMap:
     scenario, streams = hidden(1)
     _, centre, _ = day(1, scenario=scenario, streams=streams)
-    saved = centre.maps.fold.save_map("site")
+    return centre.maps.fold.save_map("site")
+
+
+@pytest.mark.parametrize(("number", "by"), [(15, (1.0, -0.5)), (8, (0.6, 0.3))])
+def test_a_landmark_without_identity_that_has_moved_is_found_and_nothing_else(number, by):
     scenario, streams = hidden(1001, [(number, by)])
-    samples, _, _ = day(1, [saved], scenario=scenario, streams=streams)
+    samples, _, _ = day(1, [hidden_site()], scenario=scenario, streams=streams)
     (found,) = changed(final_map(samples)).values()
     assert found.state == "moved"
     assert (np.abs([found.dx - by[0], found.dy - by[1]]) < 4.0 * found.sigma).all()

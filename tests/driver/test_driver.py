@@ -6,10 +6,8 @@ from itertools import count
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam import Driver, DriverError, DriverWarning, MeasurementError
-from teamslam.sim.cli.main import app
 from teamslam.team.saved_map import write_map
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -19,6 +17,7 @@ from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from tests import build
+from tests.commands import run
 from tests.support import ROOT, example, wait_until
 
 S = 10**9
@@ -490,9 +489,7 @@ def test_a_driver_of_a_team_that_is_not_there_names_those_that_are(tmp_path, cap
         mistaken = Driver("r2", team="lap", connect=endpoint, file=tmp_path / "b")
         said = f"r2: no process of team lap is at {endpoint}, but of lab: is the team's name right?"
         wait_until(lambda: said in caplog.text)
-        status = CliRunner().invoke(
-            app, ["status", "--team", "lap2", "--connect", endpoint, "--seconds", "0.5"]
-        )
+        status = run("status", "--team", "lap2", "--connect", endpoint, "--seconds", "0.5")
         assert f"no node of the team lap2 is at {endpoint}, but of lab, lap:" in status.output
         mistaken.close()
         there.close()

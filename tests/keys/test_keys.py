@@ -5,15 +5,14 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from click.testing import CliRunner
 
-from teamslam.sim.cli.main import app
 from teamslam.sim.cli.options import is_loopback
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import KeysError, load_roster, nodes_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.zenoh.access import list_owned_keys
+from tests import commands
 from tests.keys.certificates import TEAM, Folders
 
 
@@ -145,17 +144,14 @@ def test_an_open_router_for_others_needs_a_word(listen, local):
     assert is_loopback(listen) is local
     if not local:
         for command in (["router"], ["replay", "nothing.mcap"]):
-            refused = CliRunner().invoke(app, [*command, "--listen", listen])
-            assert refused.exit_code == 2
-            assert "give --keys DIR" in refused.output
-            assert "--insecure" in refused.output
+            refused = commands.output_of(*command, "--listen", listen, status=2)
+            assert "give --keys DIR" in refused
+            assert "--insecure" in refused
 
 
 def test_the_command_makes_keys_for_a_scenario_and_says_what_it_did(tmp_path):
     def run(*words: str) -> str:
-        result = CliRunner().invoke(app, ["keys", "mapping", "-o", str(tmp_path / "k"), *words])
-        assert result.exit_code == 0, result.output
-        return result.output
+        return commands.output_of("keys", "mapping", "-o", tmp_path / "k", *words)
 
     first = run("--scenario", "waypoints", "--router", "lab.example")
     assert "made     central, operator, recorder, robot-r1" in first
@@ -168,5 +164,5 @@ def test_the_command_makes_keys_for_a_scenario_and_says_what_it_did(tmp_path):
         (["keys", "t", "-o", "k", "--days", "0"], "positive"),
         (["keys", "t", "-o", "k", "--robot", "R"], "no robot's name"),
     ):
-        refused = CliRunner().invoke(app, words)
+        refused = commands.run(*words)
         assert (refused.exit_code, said in refused.output) == (2, True)

@@ -4,14 +4,13 @@ import sys
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.sim.cli import log as cli_log
-from teamslam.sim.cli.main import app
 from teamslam.team.recording.tables import ParquetTable, export_tables, numbers_of, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
+from tests.commands import output_of
 from tests.recording.logs import recorded, recorded_examples, sampled
 from tests.support import odometry
 
@@ -49,10 +48,8 @@ def test_without_pyarrow_the_command_says_what_to_install(tmp_path, monkeypatch)
     log = recorded(tmp_path / "log.mcap", [sampled(c.ODOMETRY, "alpha", odometry(1), 1)]).path
     command = ["log", "export", str(log), "-o", str(tmp_path / "out"), "--format", "parquet"]
     monkeypatch.setattr(cli_log, "find_spec", lambda name: None)
-    refused = CliRunner().invoke(app, command)
-    assert refused.exit_code == 2
-    assert f"{sys.executable} -m pip install 'pyarrow>=18'" in refused.output
+    refused = output_of(*command, status=2)
+    assert f"{sys.executable} -m pip install 'pyarrow>=18'" in refused
     monkeypatch.undo()
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 0, done.output
-    assert "odometry.parquet: 1 row\n" in done.output
+    done = output_of(*command)
+    assert "odometry.parquet: 1 row\n" in done

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from click.testing import CliRunner
 from mcap.opcode import Opcode
 
-from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import dumps, load
 from teamslam.team.recording.check import check_log, holes
 from teamslam.team.recording.inventory import Inventory
@@ -29,6 +27,7 @@ from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.router import router
 from tests import build
+from tests.commands import output_of, run
 from tests.recording.test_shell import FINAL, POSE, Team, logged
 from tests.support import odometry, received, submap, wait_until
 
@@ -221,12 +220,11 @@ def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(pa
             if samples[0].counter:
                 recorder.write([Sample("central/final", final, 0, 0, 0)])
     command = ["record", scenario, "--output", str(path)]
-    done = CliRunner().invoke(app, command)
-    assert done.exit_code == 0, done.output
+    output_of(*command)
     assert parts_of(path) == [path]
     assert numbers(path) == list(range(10))
-    assert CliRunner().invoke(app, [*command, "--resume"]).exit_code == 0
-    refused = CliRunner().invoke(app, command)
+    assert run(*command, "--resume").exit_code == 0
+    refused = run(*command)
     assert refused.exit_code == 2, "this may be another run: nothing of it would be recorded"
 
 

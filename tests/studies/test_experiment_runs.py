@@ -7,7 +7,6 @@ import msgspec
 import pytest
 from click.testing import CliRunner
 
-from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner
 from teamslam.sim.studies.experiments.cases import Cases, Done
@@ -16,6 +15,7 @@ from teamslam.sim.studies.experiments.experiment import Options, Outcome, Result
 from teamslam.sim.studies.experiments.runner import FAILURES, Plan, compute_outcomes
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
+from tests.commands import output_of
 from tests.scenarios import with_world
 
 WORK = "json:loads"
@@ -149,9 +149,7 @@ def written(folder: Path) -> dict[str, bytes]:
 
 
 def experiment(*words: object) -> str:
-    done = RUN.invoke(app, ["experiment", *map(str, words)])
-    assert done.exit_code == 0, done.output
-    return done.output
+    return output_of("experiment", *words)
 
 
 def test_merged_shards_are_the_whole_byte_for_byte(tmp_path):
@@ -171,6 +169,5 @@ def test_merged_shards_are_the_whole_byte_for_byte(tmp_path):
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "2", "a/b", "1/0"])
 def test_a_shard_is_a_number_of_a_number(text):
-    refused = RUN.invoke(app, ["experiment", "xu-4.4", "--shard", text])
-    assert refused.exit_code == 2
-    assert "as 2/8" in refused.output
+    refused = output_of("experiment", "xu-4.4", "--shard", text, status=2)
+    assert "as 2/8" in refused

@@ -1,7 +1,5 @@
 import pytest
-from click.testing import CliRunner
 
-from teamslam.sim.cli.main import app
 from teamslam.sim.studies.experiments import accuracy_worlds
 from teamslam.sim.studies.experiments.experiment import (
     Goal,
@@ -10,6 +8,7 @@ from teamslam.sim.studies.experiments.experiment import (
     runs_of,
 )
 from teamslam.sim.studies.experiments.team_runs import Figures, over_seeds
+from tests import commands
 
 
 def run(rmse: float, nees: float = 1.0, batch: float | None = 0.5, seed: int = 1) -> Figures:
@@ -73,6 +72,5 @@ _POSES = {"final_pose_nees": 1.0, "online_pose_nees": 1.0, "each_once": True}
     ],
 )
 def test_wrong_use_ends_with_2_and_says_what_is_wrong(arguments, said):
-    refused = CliRunner().invoke(app, ["experiment", *arguments])
-    assert refused.exit_code == 2
-    assert said in refused.output
+    refused = commands.output_of("experiment", *arguments, status=2)
+    assert said in refused

@@ -2,7 +2,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.clocks import (
     BEYOND_DOUBT,
@@ -16,7 +15,6 @@ from teamslam.central.desk.evaluation.log import collect_log
 from teamslam.central.desk.presence import Presence
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.sim.cli.launch import _time_warnings
-from teamslam.sim.cli.main import app
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
@@ -25,6 +23,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
+from tests.commands import run
 from tests.scenarios import scenario_in
 from tests.sim.logs import final_map, samples
 from tests.trials.stress_world import StressWorld, write
@@ -116,7 +115,7 @@ def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path)
         (tmp_path / "set" / robot).mkdir(parents=True)
         times = rows.format(begin, begin + 30, begin + 60)
         (tmp_path / "set" / robot / "odometry.csv").write_text(times)
-    said = CliRunner().invoke(app, ["import", str(tmp_path / "set"), "-o", str(tmp_path / "mine")])
+    said = run("import", tmp_path / "set", "-o", tmp_path / "mine")
     expected = "r1 from 0 s to 60 s; r2 from 2023-11-14 22:13:20 UTC to 2023-11-14 22:14:20 UTC"
     assert expected in said.output
     of = with_options(load(str(scenario_beside(tmp_path / "mine"))), dataset=tmp_path / "mine")

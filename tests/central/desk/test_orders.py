@@ -3,7 +3,7 @@ from contextlib import nullcontext
 
 import msgspec
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk import orders
@@ -11,11 +11,11 @@ from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.central.node import CentralNode
-from teamslam.sim.cli.main import app
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
+from tests import commands
 from tests.support import examples, fused_map, on_its_key, wait_until
 
 FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
@@ -149,7 +149,7 @@ def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgeme
         "teamslam.sim.cli.options.connect_bus", lambda *_: nullcontext(MemoryBus(network))
     )
     try:
-        return CliRunner().invoke(app, ["verdict", *words, "--team", "t"])
+        return commands.run("verdict", *words, "--team", "t")
     finally:
         over.set()
         thread.join()

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
@@ -13,11 +12,11 @@ from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.report import page as report_page
 from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run, run_figures
-from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Sample
+from tests import commands
 from tests.sim.logs import joined_log, scenario, streams, world_log
 
 PICTURES = ["map", "errors", "consistency"]
@@ -128,10 +127,9 @@ def written(log: list[Sample], path: Path) -> Path:
 @pytest.mark.usefixtures("_without_pictures")
 def test_the_command_proves_the_ledger_and_says_so(log, tmp_path):
     file = written(log, tmp_path / "log.mcap")
-    done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
-    assert "has exactly one disposition" in done.output
-    assert re.search(r"^NIS per dof: r1 [\d.]+, r2 [\d.]+$", done.output, re.MULTILINE)
+    done = commands.output_of("report", file, "-o", tmp_path / "out")
+    assert "has exactly one disposition" in done
+    assert re.search(r"^NIS per dof: r1 [\d.]+, r2 [\d.]+$", done, re.MULTILINE)
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert re.search(r'class="good">Ledger: each of \d+ measurements has exactly one', page)
     figures = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
@@ -142,18 +140,16 @@ def test_the_command_proves_the_ledger_and_says_so(log, tmp_path):
 @pytest.mark.usefixtures("_without_pictures")
 def test_a_log_that_lacks_what_the_ledger_needs_names_it_beside_the_run_or_in_a_folder(tmp_path):
     file = written(joined_log(scenario(), 0.1), tmp_path / "log.mcap")
-    done = CliRunner().invoke(app, ["report", str(file), "-o", str(tmp_path / "out")])
-    assert done.exit_code == 0, done.output
+    commands.output_of("report", file, "-o", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "the log has no configuration of robot/r1" in page
-    beside = CliRunner().invoke(app, ["report", str(file), "--no-ledger"])
+    beside = commands.run("report", file, "--no-ledger")
     assert beside.exit_code == 0, beside.output
     assert f"wrote {tmp_path / 'report.html'}" in beside.output.replace("\n", "")
     other = tmp_path / "other.mcap"
     file.rename(other)
-    beside = CliRunner().invoke(app, ["report", str(other), "--no-ledger"])
+    beside = commands.run("report", other, "--no-ledger")
     assert (tmp_path / "other" / "report.html").is_file()
     file = other
-    told = CliRunner().invoke(app, ["report", str(file), "-o", str(file)])
-    assert told.exit_code == 2
-    assert "give a folder" in told.output
+    told = commands.output_of("report", file, "-o", file, status=2)
+    assert "give a folder" in told

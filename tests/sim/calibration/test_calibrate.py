@@ -5,7 +5,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.calibration.calibrate import Calibration, calibrate_models
@@ -22,7 +21,6 @@ from teamslam.sim.calibration.motion import fit_motion
 from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
 from teamslam.sim.calibration.sensor import fit_sensor
-from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.utias_writer import write_utias
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
@@ -31,6 +29,7 @@ from teamslam.sim.world.streams import (
     grouped,
 )
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from tests.commands import output_of, run
 from tests.sim.logs import scenario, streams
 
 SECOND = 1_000_000_000
@@ -270,26 +269,24 @@ def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_
 ):
     write_utias(slipping[1], tmp_path / "set")
     (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
-    said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "set")])
-    assert said.exit_code == 1
-    assert "set r2: no ground truth: nothing is learnt from it" in said.output
-    assert "these data have 20: give several data sets at once, record 1.7 minutes" in said.output
-    assert "where the path is known throughout" in said.output
+    said = output_of("calibrate", tmp_path / "set", status=1)
+    assert "set r2: no ground truth: nothing is learnt from it" in said
+    assert "these data have 20: give several data sets at once, record 1.7 minutes" in said
+    assert "where the path is known throughout" in said
 
 
 def test_a_log_that_is_too_short_and_a_wrong_name_end_with_their_reason(tmp_path):
     team = scenario()
     with pytest.raises(CalibrationError, match="needs 30 stretches of 10 s"):
         calibrate_models([("a log", streams(team))], team, lambda text: None)
-    result = CliRunner().invoke(app, ["calibrate", "a.zip", "-o", str(tmp_path / "a.json")])
-    assert result.exit_code == 2
-    assert "ends in .toml" in result.output
+    result = output_of("calibrate", "a.zip", "-o", tmp_path / "a.json", status=2)
+    assert "ends in .toml" in result
 
 
 def test_an_output_in_a_folder_that_can_not_be_made_is_refused_before_the_data_is_read(tmp_path):
     (tmp_path / "file").touch()
     for folder, reads in (("file", False), ("new/folder", True)):
         output = str(tmp_path / folder / "mine.toml")
-        result = CliRunner().invoke(app, ["calibrate", str(tmp_path / "none"), "-o", output])
+        result = run("calibrate", tmp_path / "none", "-o", output)
         assert result.exit_code != 0
         assert ("reading" in result.output) == reads

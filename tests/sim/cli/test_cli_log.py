@@ -14,6 +14,7 @@ from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.messages import Increment
+from tests import commands
 from tests.sim.logs import scenario, streams, world_log
 
 
@@ -173,7 +174,7 @@ def test_a_log_with_a_hole_says_so_in_every_command(tmp_path, monkeypatch, words
     with Recorder(tmp_path / "hole.mcap", "small", {"seed": "1"}) as recorder:
         lost = [s for s in published() if s.key == "source/r2/odometry"][5:8]
         recorder.write([sample for sample in published() if sample not in lost])
-    result = CliRunner().invoke(app, [*words, "hole.mcap"])
+    result = commands.run(*words, "hole.mcap")
     failed = result.exception
     assert failed is None or isinstance(failed, SystemExit | LogError | DatasetError)
     said = " ".join(f"{result.stdout} {result.stderr} {failed}".split())

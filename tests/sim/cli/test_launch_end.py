@@ -4,7 +4,6 @@ from io import StringIO
 
 import pytest
 from click.exceptions import Exit
-from click.testing import CliRunner
 from rich.console import Console
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
@@ -12,12 +11,12 @@ from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.report import page
 from teamslam.central.desk.report.run import Run
 from teamslam.sim.cli import launch
-from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.launch.launch import Outcome
 from teamslam.sim.scenarios.scenario import dumps
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
+from tests import commands
 from tests.scenarios import with_world
 from tests.sim.logs import scenario, streams
 
@@ -34,7 +33,7 @@ def test_a_launch_that_is_interrupted_as_it_is_scored_says_where_the_log_is_and_
     monkeypatch.setattr(launch, "_launch", lambda *_: outcome)
     monkeypatch.setattr(launch, "_conclude", interrupted)
     words = ["launch", "thesis", "-o", str(log.parent), "--json", str(figures)]
-    ended = CliRunner().invoke(app, words)
+    ended = commands.run(*words)
     assert ended.exit_code == 130, ended.output
     assert f"interrupted: the run is in {log}" in ended.stderr
     assert not figures.exists()
@@ -93,6 +92,5 @@ def test_a_run_whose_map_has_no_landmark_fails_with_the_reason(tmp_path):
         launch._conclude(of, outcome, None, report=False)
     assert ended.value.exit_code == 1
     assert [each for each in outcome.failures if "the final map has no landmark" in each]
-    again = CliRunner().invoke(app, ["rerun", str(log), "--noise", "bearing=2"])
-    assert again.exit_code == 1
-    assert "the final map has no landmark" in again.output
+    again = commands.output_of("rerun", log, "--noise", "bearing=2", status=1)
+    assert "the final map has no landmark" in again

@@ -4,9 +4,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
@@ -21,6 +19,7 @@ from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire.arrays import floats
 from tests import teams
+from tests.commands import run
 
 
 def data_set(path: Path, **tables: str) -> Path:
@@ -373,7 +372,7 @@ def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path):
 
 def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path):
     data_set(tmp_path, odometry=SPEEDS, observations=SEEN + "x,1,1,1\n")
-    result = CliRunner().invoke(app, ["launch", "--dataset", str(tmp_path)])
+    result = run("launch", "--dataset", tmp_path)
     assert "no scenario given" in result.output
     assert "It assumes odometry that is off by" in result.output
     assert isinstance(result.exception, DatasetError)
@@ -402,7 +401,7 @@ def test_a_file_that_is_no_data_set_is_refused_with_all_formats(tmp_path, conten
 
 def test_import_of_a_folder_without_measurements_makes_none(tmp_path):
     data_set(tmp_path / "a", landmarks="landmark,x_m,y_m\n1,2,3\n")
-    done = CliRunner().invoke(app, ["import", str(tmp_path / "a"), "-o", str(tmp_path / "b")])
+    done = run("import", tmp_path / "a", "-o", tmp_path / "b")
     assert isinstance(done.exception, DatasetError)
     assert "neither odometry nor observations" in str(done.exception)
     assert not (tmp_path / "b").exists()

@@ -2,10 +2,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.sim.calibration.data import messages_of
-from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
@@ -18,6 +16,7 @@ from teamslam.sim.world.streams import FIXES, NO_LABEL, OBSERVATIONS, ODOMETRY
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.wire import messages as m
+from tests.commands import run
 from tests.scenarios import with_world
 
 
@@ -167,7 +166,7 @@ def test_what_is_wrong_with_a_table_is_named(steps, table, text, why):
 
 
 def launched(*words):
-    result = CliRunner().invoke(app, ["launch", *map(str, words)])
+    result = run("launch", *words)
     assert isinstance(result.exception, DatasetError), result.output
     return str(result.exception)
 

@@ -6,10 +6,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.sim.cli.main import app
 from teamslam.sim.datasets import utias as errata
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.utias import utias
@@ -28,6 +26,7 @@ from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStrea
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire import messages as m
 from tests import build
+from tests.commands import run
 from tests.scenarios import with_front_ends, with_world
 
 REAL = Path(__file__).parents[4] / "shared" / "utias"
@@ -149,7 +148,7 @@ def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(fol
 
 @pytest.mark.parametrize("name", ["waypoints", "downs-100"])
 def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(name, tmp_path):
-    done = CliRunner().invoke(app, ["simulate", name, "-o", str(tmp_path / "set")])
+    done = run("simulate", name, "-o", tmp_path / "set")
     assert done.exit_code == 0
     scenario = load(tmp_path / "set" / "scenario.toml")
     source = load(name)

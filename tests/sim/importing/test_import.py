@@ -2,10 +2,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from teamslam.sim.cli.importing import readable
-from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.tables import DatasetError
@@ -14,7 +13,7 @@ from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.world.streams import WorldStreams
-from tests import teams
+from tests import commands, teams
 from tests.ros2 import messages as ros
 from tests.sim.datasets.test_folder import same
 
@@ -24,7 +23,7 @@ ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
 
 
 def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["import", *map(str, arguments)])
+    return commands.run("import", *arguments)
 
 
 def read(path: Path) -> WorldStreams:
@@ -110,14 +109,13 @@ def test_of_a_bag_whose_recorder_was_killed_all_that_is_whole_is_taken(tmp_path)
     refused = run(bag, "-o", tmp_path / "set")
     command = f"teamslam repair {file} -o WHOLE.mcap"
     assert command in str(refused.exception)
-    repaired = CliRunner().invoke(app, ["repair", str(file), "-o", str(tmp_path / "whole.mcap")])
-    assert repaired.exit_code == 0, repaired.output
+    commands.output_of("repair", file, "-o", tmp_path / "whole.mcap")
     result = run(tmp_path / "whole.mcap", "-o", tmp_path / "set")
     assert result.exit_code == 0, result.output
     first, second = (tmp_path / each for each in ("set", "without_metadata"))
     assert same(read(first), read(second))
     file.write_bytes(whole[:20])
-    none = CliRunner().invoke(app, ["repair", str(file), "-o", str(tmp_path / "none.mcap")])
+    none = commands.run("repair", file, "-o", tmp_path / "none.mcap")
     assert "no whole message in it" in str(none.exception)
     assert not (tmp_path / "none.mcap").exists()
 
@@ -138,9 +136,7 @@ def test_a_bag_that_does_not_say_what_is_what_is_listed_with_what_to_type(tmp_pa
 
 def test_launch_takes_a_bag_and_says_what_is_wrong_with_it(tmp_path):
     (tmp_path / "bag.mcap").write_bytes(b"not a bag")
-    result = CliRunner().invoke(
-        app, ["launch", "--dataset", str(tmp_path / "bag.mcap"), "-o", str(tmp_path / "run")]
-    )
+    result = commands.run("launch", "--dataset", tmp_path / "bag.mcap", "-o", tmp_path / "run")
     assert isinstance(result.exception, DatasetError)
     assert "no ROS 2 bag, or a damaged one" in str(result.exception)
 

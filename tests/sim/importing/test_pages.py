@@ -5,15 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 from teamslam.sim.calibration.data import LEAST_SPANS, SPAN_S, moving_stretches
 from teamslam.sim.cli import launch
-from teamslam.sim.cli.main import app, load_all
+from teamslam.sim.cli.main import load_all
 from teamslam.sim.importing.columns import load_map
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.team.ros2.topics import load_topics
+from tests.commands import output_of
 
 ROOT = Path(__file__).parents[3]
 
@@ -92,16 +92,14 @@ def test_the_bag_of_the_page_is_listed_and_imported(tmp_path, monkeypatch):
     page = (ROOT / "docs" / "your_ros2_robot.md").read_text("utf-8")
     command = re.search(r"`(python examples/\S+ my_bag)`", page)
     made(command[1], tmp_path)
-    listed = CliRunner().invoke(app, ["import", "my_bag"])
-    assert listed.exit_code == 0
-    assert "`teamslam import my_bag -o FOLDER` imports these topics" in listed.output
-    proposal = listed.output.partition("into topics.toml:\n\n")[2].partition("\nand type")[0]
+    listed = output_of("import", "my_bag")
+    assert "`teamslam import my_bag -o FOLDER` imports these topics" in listed
+    proposal = listed.partition("into topics.toml:\n\n")[2].partition("\nand type")[0]
     (tmp_path / "topics.toml").write_text(proposal)
     typed = "import my_bag -o my_set --ros2 topics.toml"
     assert f"teamslam {typed}" in page
-    assert "teamslam import my_bag -o FOLDER --ros2 topics.toml" in listed.output
-    done = CliRunner().invoke(app, typed.split())
-    assert done.exit_code == 0, done.output
+    assert "teamslam import my_bag -o FOLDER --ros2 topics.toml" in listed
+    output_of(*typed.split())
     scenario = load(scenario_beside("my_set"))
     assert scenario.robots[0].sensor.mount == pytest.approx((0.2, 0.0, 0.0), abs=1e-12)
     (stream,) = streams_of(scenario).streams
@@ -122,8 +120,7 @@ def test_the_commands_of_a_team_over_wifi_are_sound(tmp_path, monkeypatch):
     section = page.partition("## A team over Wi-Fi")[2].partition("\n## ")[0]
     typed = [line.split()[1:] for line in section.splitlines() if line.startswith("    teamslam")]
     assert [words[0] for words in typed] == ["keys", "router", "record", "central", "robot"]
-    made = CliRunner().invoke(app, typed[0])
-    assert made.exit_code == 0, made.output
+    output_of(*typed[0])
     names = {path.name for path in (tmp_path / "keys").rglob("*")}
     for node in ("robot-r1", "source-r1", "robot-r2", "central", "recorder"):
         assert any(name.startswith(node) for name in names), node

@@ -3,11 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.optimize import least_squares
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.graph import read_pyfg
 from teamslam.sim.datasets.graph_lines import read_graph
@@ -16,6 +14,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
+from tests.commands import output_of, run
 from tests.scenarios import with_front_ends
 from tests.sim.logs import scenario, streams, world_log
 
@@ -79,8 +78,7 @@ def log(tmp_path_factory):
 
 
 def exported(log: Path, folder: Path, form: str) -> str:
-    done = CliRunner().invoke(app, ["log", "export", str(log), "-o", str(folder), "--format", form])
-    assert done.exit_code == 0, done.output
+    output_of("log", "export", log, "-o", folder, "--format", form)
     return (folder / f"graph.{form}").read_text()
 
 
@@ -97,7 +95,7 @@ def test_every_format_holds_the_same_edges(log, tmp_path):
     exported(log, tmp_path / "g2o", "g2o")
     exported(log, tmp_path / "pyfg", "pyfg")
     isam = ["log", "export", str(log), "-o", str(tmp_path / "isam"), "--format", "isam"]
-    assert CliRunner().invoke(app, isam).exit_code == 0
+    assert run(*isam).exit_code == 0
     g2o = read_graph(tmp_path / "g2o" / "graph.g2o")
     pyfg = read_pyfg(tmp_path / "pyfg" / "graph.pyfg")
     isams = [read_graph(path) for path in sorted((tmp_path / "isam").glob("*.txt"))]
@@ -121,7 +119,7 @@ def test_a_log_without_a_map_is_placed_by_odometry(tmp_path):
     with Recorder(path, "small", {}) as recorder:
         recorder.write(world_log(scenario()))
     args = ["log", "export", str(path), "-o", str(tmp_path / "out"), "--format", "g2o"]
-    done = CliRunner().invoke(app, args)
+    done = run(*args)
     if done.exit_code == 0:
         assert read_graph(tmp_path / "out" / "graph.g2o").point_edges
     else:
@@ -140,7 +138,6 @@ def data_set(tmp_path_factory):
 def test_a_data_set_is_rerun_under_other_conditions(data_set, tmp_path):
     to = tmp_path / "figures.json"
     arguments = ["rerun", str(data_set), "--delay", "2", "--json", str(to)]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
-    assert "final map: the same bytes" in result.output
+    result = output_of(*arguments)
+    assert "final map: the same bytes" in result
     assert json.loads(to.read_text())["same_final_map"]

@@ -4,10 +4,8 @@ import re
 
 import msgspec
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.config import CentralConfig, CommonBiasSigmas, SurveyedLandmark
-from teamslam.sim.cli.main import app
 from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.config import (
@@ -29,6 +27,7 @@ from teamslam.team.config import (
     Sensor,
 )
 from teamslam.team.pairs import ESTIMATORS, RULES
+from tests.commands import run
 from tests.support import ROOT
 
 PAGE = ROOT / "docs" / "scenario.md"
@@ -95,7 +94,7 @@ def test_the_scenario_that_a_page_shows_gives_three_robots_their_streams(page, t
 
 
 def test_a_built_in_scenario_that_was_shown_is_the_same_one_as_a_file(tmp_path):
-    shown = CliRunner().invoke(app, ["scenarios", "--show", "waypoints"])
+    shown = run("scenarios", "--show", "waypoints")
     file = tmp_path / "waypoints.toml"
     file.write_text(shown.stdout, encoding="utf-8")
     assert load(file) == load("waypoints")
