@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from teamslam.team.config import Bounds
 from teamslam.team.driver import journal as j
-from teamslam.team.driver import measurement_messages
+from teamslam.team.driver import measurement_messages as make
 from teamslam.team.driver.link import Link
 from teamslam.team.driver.measurement_messages import DriverWarning, MeasurementError
 from teamslam.team.driver.motion import Odometer, Pose, relative_pose
@@ -90,8 +90,8 @@ class Driver:
         on_message: Callable[[m.Message], None] | None = None,
         map: Path | str | None = None,  # noqa: A002
     ) -> None:
-        if not re.fullmatch(measurement_messages.NAME, robot):
-            raise DriverError(f"{robot!r} is no robot's name: {measurement_messages.NAMED}")
+        if not re.fullmatch(make.NAME, robot):
+            raise DriverError(f"{robot!r} is no robot's name: {make.NAMED}")
         self.robot = robot
         self._bounds = Bounds() if bounds is None else bounds
         self._fastest_turn = LIKELY_RAD_S if bounds is None else self._bounds.yaw_rate_rad_s
@@ -152,7 +152,7 @@ class Driver:
         """
         stamp_ns, length_ns = _times(t, duration, "odometry")
         what = f"odometry of {self.robot} at {t} s"
-        v, w = measurement_messages.check_speeds(forward, yaw_rate, what)
+        v, w = make.check_speeds(forward, yaw_rate, what)
         if abs(w) > self._fastest_turn:
             raise MeasurementError(
                 f"{what}: a yaw rate of {w:g} rad/s is {abs(w) / (2.0 * np.pi):.1f} turns a "
@@ -166,7 +166,7 @@ class Driver:
             self._odometer.judge(step, lasts_ns or 10**9, "odometry", stamp_ns)
             interval = None
             if lasts_ns is not None:
-                head = measurement_messages.head_of(self.robot, stamp_ns)
+                head = make.head_of(self.robot, stamp_ns)
                 interval = m.Odometry(**head, duration_ns=lasts_ns, forward=v, yaw_rate=w)
             self._drive(stamp_ns, interval, step)
 
@@ -182,9 +182,7 @@ class Driver:
         The motion is in the frame of its start pose; covariance (3 × 3) in that of its end pose.
         """
         stamp_ns, length_ns = _times(t, duration, "odometry_increment")
-        step = measurement_messages.pose_of(
-            increment, f"odometry_increment of {self.robot} at {t} s"
-        )
+        step = make.pose_of(increment, f"odometry_increment of {self.robot} at {t} s")
         with self._lock:
             lasts_ns = self._until(stamp_ns, length_ns, "odometry_increment")
             interval = None
@@ -205,10 +203,8 @@ class Driver:
 
         covariance: 3 × 3, of the motion since the last call, in the frame of its end pose.
         """
-        stamp_ns = measurement_messages.stamp_of(t, "odometry_pose")
-        pose = measurement_messages.pose_of(
-            (x, y, theta), f"odometry_pose of {self.robot} at {t} s"
-        )
+        stamp_ns = make.stamp_of(t, "odometry_pose")
+        pose = make.pose_of((x, y, theta), f"odometry_pose of {self.robot} at {t} s")
         with self._lock:
             lasts_ns = self._until(stamp_ns, None, "odometry_pose", longest_s=AWAY_S)
             before, interval, step = self._odometer.pose, None, (0.0, 0.0, 0.0)
@@ -235,10 +231,8 @@ class Driver:
 
         covariances: L × 2 × 2 of (range, bearing); None: the sensor's noise.
         """
-        stamp_ns = measurement_messages.stamp_of(t, "observe")
-        seen = measurement_messages.observations(
-            self.robot, stamp_ns, ids, (ranges, bearings), covariances
-        )
+        stamp_ns = make.stamp_of(t, "observe")
+        seen = make.observations(self.robot, stamp_ns, ids, (ranges, bearings), covariances)
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
@@ -253,8 +247,8 @@ class Driver:
 
         covariances: L × 2 × 2; None: the sensor's noise of range and bearing.
         """
-        stamp_ns = measurement_messages.stamp_of(t, "observe_points")
-        seen = measurement_messages.points(self.robot, stamp_ns, ids, xy, covariances)
+        stamp_ns = make.stamp_of(t, "observe_points")
+        seen = make.points(self.robot, stamp_ns, ids, xy, covariances)
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
@@ -270,18 +264,16 @@ class Driver:
 
         classes: a row P(its reported class | class c) for each landmark.
         """
-        stamp_ns = measurement_messages.stamp_of(t, "detect")
-        seen = measurement_messages.detections(
-            self.robot, stamp_ns, (ranges, bearings), covariances, classes
-        )
+        stamp_ns = make.stamp_of(t, "detect")
+        seen = make.detections(self.robot, stamp_ns, (ranges, bearings), covariances, classes)
         self._see(j.OBSERVATIONS, seen)
 
     def sight(
         self, t: float | Decimal, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
     ) -> None:
         """Add inter-robot measurements at t: teammates' names, ranges [m] and bearings [rad]."""
-        stamp_ns = measurement_messages.stamp_of(t, "sight")
-        seen = measurement_messages.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
+        stamp_ns = make.stamp_of(t, "sight")
+        seen = make.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
         self._see(j.SIGHTINGS, seen)
 
     def fix(
@@ -291,8 +283,8 @@ class Driver:
 
         covariance: 2 × 2 [m²]; None: `gnss.sigma_m` of the robot's configuration.
         """
-        stamp_ns = measurement_messages.stamp_of(t, "fix")
-        self._see(j.SIGHTINGS, measurement_messages.fix(self.robot, stamp_ns, (x, y), covariance))
+        stamp_ns = make.stamp_of(t, "fix")
+        self._see(j.SIGHTINGS, make.fix(self.robot, stamp_ns, (x, y), covariance))
 
     # State.
 
@@ -494,12 +486,12 @@ class Driver:
         self, stamp_ns: int, lasts_ns: int, step: Pose, covariance: ArrayLike | None
     ) -> m.Increment:
         what = f"the covariance of {self.robot} at {1e-9 * stamp_ns:.3f} s"
-        return measurement_messages.check_sound(
+        return make.check_sound(
             m.Increment(
-                **measurement_messages.head_of(self.robot, stamp_ns),
+                **make.head_of(self.robot, stamp_ns),
                 duration_ns=lasts_ns,
                 increment=from_floats(step),
-                covariance=measurement_messages.square(covariance, what),
+                covariance=make.square(covariance, what),
             ),
             what,
         )
@@ -587,8 +579,8 @@ class Driver:
 def _times(
     t: float | Decimal, duration: float | Decimal | None, call: str
 ) -> tuple[int, int | None]:
-    length_ns = None if duration is None else measurement_messages.stamp_of(duration, "a duration")
-    return measurement_messages.stamp_of(t, call), length_ns
+    length_ns = None if duration is None else make.stamp_of(duration, "a duration")
+    return make.stamp_of(t, call), length_ns
 
 
 def _read_map(path: Path, *, with_keys: bool) -> m.SavedMap:
@@ -608,12 +600,10 @@ def _start_of(
     if start is None:
         return b"", b""
     what = f"the start of {robot}"
-    pose = measurement_messages.pose_of(start, what)
+    pose = make.pose_of(start, what)
     if abs(pose[2]) > 2.0 * np.pi:
         raise MeasurementError(f"{what}: theta is {pose[2]:g}; it is in radians, in one turn")
-    packed = measurement_messages.square(covariance, what)
+    packed = make.square(covariance, what)
     if covariance is not None:
-        measurement_messages.check_definite(
-            np.asarray(covariance, dtype=np.float64)[np.newaxis], what
-        )
+        make.check_definite(np.asarray(covariance, dtype=np.float64)[np.newaxis], what)
     return from_floats(pose), packed

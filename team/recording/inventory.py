@@ -130,10 +130,6 @@ class Numbered:
             sums.append(following)
         return True
 
-    def note_number(self, newest: int) -> None:
-        """Register a number named by a message."""
-        self.newest = max(self.newest, newest)
-
     @property
     def missing(self) -> list[tuple[int, int]]:
         """Intervals of known, missing numbers."""
@@ -148,7 +144,7 @@ class Inventory:
     """Numbered streams of a log, sample by sample; earlier parts' messages may be repeated."""
 
     has_earlier_parts: bool = False
-    streams: dict[NumberedStream, Numbered] = field(default_factory=dict)
+    streams: dict[NumberedStream, Numbered] = field(default_factory=lambda: defaultdict(Numbered))
     received: Received = field(default_factory=Received, init=False)
     _earlier: set[int] = field(default_factory=set, init=False)
     _contents: set[int] = field(default_factory=set, init=False)
@@ -176,7 +172,8 @@ class Inventory:
             named = numbered_in(sample.payload)
             if named is None:
                 return True
-            return self._of(role, robot, named.incarnation).take(named.number, sample.payload)
+            stream = NumberedStream(role, robot, named.incarnation)
+            return self.streams[stream].take(named.number, sample.payload)
         if role == "reply":
             name = hash((sample.key, sample.payload))
             known = name in self._contents
@@ -186,30 +183,23 @@ class Inventory:
             self._note_totals(sample)
         return True
 
-    def _of(self, kind: Kind, robot: str, incarnation: int) -> Numbered:
-        stream = NumberedStream(kind, robot, incarnation)
-        found = self.streams.get(stream)
-        if found is None:
-            found = self.streams[stream] = Numbered()
-        return found
-
     def _note_totals(self, sample: Sample) -> None:
         found = try_open(sample)
         match None if found is None else found[2]:  # reported by the message's reader
             case m.Progress() | m.Done() as counted:
-                self._note_measurements(counted)
-                submaps = self._of("submaps", counted.robot, counted.incarnation)
-                submaps.note_number(counted.submaps - 1)
+                self._note_total("measurements", counted, counted.measurements)
+                self._note_total("submaps", counted, counted.submaps)
             case m.StreamHead() as head:
-                self._note_measurements(head)
+                self._note_total("measurements", head, head.measurements)
             case m.End() as ended:
                 for end in ended.streams:
-                    self._note_measurements(end)
-            case _:
-                pass
+                    self._note_total("measurements", end, end.measurements)
 
-    def _note_measurements(self, of: m.Progress | m.Done | m.StreamHead | m.StreamEnd) -> None:
-        self._of("measurements", of.robot, of.incarnation).note_number(of.measurements - 1)
+    def _note_total(
+        self, kind: Kind, of: m.Progress | m.Done | m.StreamHead | m.StreamEnd, count: int
+    ) -> None:
+        stream = self.streams[NumberedStream(kind, of.robot, of.incarnation)]
+        stream.newest = max(stream.newest, count - 1)
 
     def counts(self) -> dict[tuple[str, int], tuple[int, int]]:
         """Count present measurements and submaps by (robot, incarnation)."""

@@ -6,7 +6,7 @@ CSV, exactly readable, lists in Parquet. Digests are hexadecimal, lists and tabl
 
 import csv
 import json
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from teamslam.team.recording.reader import Log
 from teamslam.team.wire.arrays import floats, ids, octets, stamps
-from teamslam.team.wire.bus import Sample, opened
+from teamslam.team.wire.bus import opened
 from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.messages import Digest, Message, tag_of
@@ -27,18 +27,9 @@ HEAD = ("key", "counter", "wall_ns")
 LATEST_NS = 2**63 - 1
 """Largest wall clock [ns] of a table; larger ones are from damaged or hostile logs."""
 _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
-    "ids": ids,
-    "stamps": stamps,
-    "nodes": stamps,
-    "counts": ids,
-    "labels": ids,
-    "landmarks": ids,
-    "rows": ids,
-    "seen": octets,
-    "pairs": octets,
-    "certificate": octets,
-    "signature": octets,
-    "sha256": octets,
+    **dict.fromkeys(("ids", "counts", "labels", "landmarks", "rows"), ids),
+    **dict.fromkeys(("stamps", "nodes"), stamps),
+    **dict.fromkeys(("seen", "pairs", "certificate", "signature", "sha256"), octets),
 }
 """Decoder of a field's bytes by name; other fields are floats."""
 
@@ -49,20 +40,6 @@ class Exported:
 
     rows: dict[Path, int] = field(default_factory=dict)
     unsound: int = 0
-
-    def messages(
-        self, log: Log, channels: Collection[Channel] | None
-    ) -> Iterator[tuple[Sample, Channel, Message]]:
-        """Yield the valid messages of the channels (None: all), without views; count the others."""
-        for sample in log.samples(channels):
-            if channel_of(sample.key) is None:
-                continue
-            try:
-                channel, _, message = opened(sample)
-            except WireError:
-                self.unsound += 1
-                continue
-            yield sample, channel, message
 
 
 def table_of(channel: Channel, message: Message) -> str:
@@ -158,7 +135,14 @@ def export_tables(
     exported, ending = Exported(), "csv" if form is CsvTable else "parquet"
     with ExitStack() as files:
         tables: dict[Path, CsvTable | ParquetTable] = {}
-        for sample, channel, message in exported.messages(log, channels):
+        for sample in log.samples(channels):
+            if channel_of(sample.key) is None:  # as of a view
+                continue
+            try:
+                channel, _, message = opened(sample)
+            except WireError:
+                exported.unsound += 1
+                continue
             path = folder / f"{table_of(channel, message)}.{ending}"
             if path not in tables:
                 tables[path] = files.enter_context(closing(form(path, type(message))))
