@@ -47,22 +47,16 @@ def frame_name(robot: str, incarnation: int) -> str:
 def pose_of(message: m.InitialPose) -> tuple[Float[np.ndarray, "3"] | None, Matrix | None]:
     """Read the initial pose (None: unknown) and its covariance (None: exactly known)."""
     pose = floats(message.pose, "pose").copy() if message.pose else None
-    covariance = (
-        floats(message.covariance, "covariance").reshape(3, 3).copy()
-        if message.covariance
-        else None
-    )
-    return pose, covariance
+    P = floats(message.covariance, "covariance").reshape(-1, 3).copy()
+    return pose, P if message.covariance else None
 
 
 def start_of(message: m.InitialPose) -> InitialPoseFactor | None:
     """Read the initial pose as a factor of map joining; None for an unknown pose."""
     pose, covariance = pose_of(message)
-    return (
-        None
-        if pose is None
-        else InitialPoseFactor(message.robot, message.incarnation, pose, covariance)
-    )
+    if pose is None:
+        return None
+    return InitialPoseFactor(message.robot, message.incarnation, pose, covariance)
 
 
 def scan_of(message: m.AnyScan | m.Detections) -> Scan:
@@ -228,13 +222,8 @@ def fix_of(message: m.Fix, config: RobotConfig) -> CarriedPoint:
 
 def contribution_of(message: m.Submap) -> Contribution:
     """Read the submap as a contribution to map joining."""
-    return Contribution(
-        message.robot,
-        message.incarnation,
-        message.sequence,
-        message.stamp_ns,
-        local_map_of(message),
-    )
+    stream = message.robot, message.incarnation
+    return Contribution(*stream, message.sequence, message.stamp_ns, local_map_of(message))
 
 
 def own_biases_of(saved: m.SavedMap) -> OwnBiases:
@@ -332,10 +321,7 @@ def landmarks_of(
     message: m.MapEstimate | m.FusedMap | m.TruthLandmarks | m.KnownMap,
 ) -> tuple[UInt32[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
     """Read identities and positions [m] of a map message."""
-    if isinstance(message, m.TruthLandmarks | m.KnownMap):
-        values = message.positions
-    else:
-        values = message.means
+    values = message.positions if isinstance(message, m.LandmarkPositions) else message.means
     return (
         ids(message.ids, "ids").astype(np.uint32),
         floats(values, "means").astype(np.float64).reshape(-1, 2),
@@ -359,6 +345,10 @@ def _prior(fused: m.FusedMap, stream: Stream, **fields: Any) -> m.Prior:
 def prior_message(fused: m.FusedMap, stream: Stream, sequence: int, prior: RobotPrior) -> m.Prior:
     """Make the prior of a robot in the team's map, up to its submap `sequence`."""
     robot, incarnation = stream
+    biases = (
+        m.BiasEstimate(robot=robot, incarnation=incarnation, bias=bias, value=value, sigma=sigma)
+        for bias, value, sigma in prior.shared.biases
+    )
     return _prior(
         fused,
         stream,
@@ -367,12 +357,7 @@ def prior_message(fused: m.FusedMap, stream: Stream, sequence: int, prior: Robot
         mean=from_floats(np.concatenate((prior.pose, prior.means.ravel()))),
         covariance=joint_bytes(prior.covariance),
         covariance_factor=prior.shared.covariance_factor,
-        biases=tuple(
-            m.BiasEstimate(
-                robot=robot, incarnation=incarnation, bias=bias, value=value, sigma=sigma
-            )
-            for bias, value, sigma in prior.shared.biases
-        ),
+        biases=tuple(biases),
         frame=fused.frame,
     )
 

@@ -136,20 +136,15 @@ class _Evidence:
                 continue
             numbered = not self.part and row is not None and row[0] in _NUMBERED
             totals = tuple(self.totals.get(key, {}).values())
-            for line in self.counters[key].findings(
-                part=self.part, numbered=numbered, totals=totals
-            ):
-                yield Finding(key, line + (DRAWN if ch.VIEW.owner(key) is not None else ""))
+            lines = self.counters[key].findings(part=self.part, numbered=numbered, totals=totals)
+            again = DRAWN if ch.VIEW.owner(key) is not None else ""
+            yield from (Finding(key, line + again) for line in lines)
         if self.repaired and not self.part and not self.channels & _FINAL:
             yield Finding(FILE, NO_FINAL)
         if not self.part:
             yield from (Finding(*found) for found in self.inventory.findings())
             yield from self.killed()
-            if self.channels & set(_OF_AN_END) and not self.channels & {
-                ch.END,
-                ch.HEAD,
-                ch.ROBOT_HEAD,
-            }:
+            if self.channels & _OF_AN_END and not self.channels & _TOTALS:
                 yield Finding(ch.END.key(), NO_END)
         for note in self.last_word:
             if note.startswith(MISSING):
@@ -159,7 +154,8 @@ class _Evidence:
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}  # channels published after the end of the streams
-_READ = {ch.END, ch.HEAD, ch.ROBOT_HEAD, ch.ROBOT_DONE, *_FINAL, ch.TALLY, ch.STATUS}
+_TOTALS = {ch.END, ch.HEAD, ch.ROBOT_HEAD}
+_READ = {*_TOTALS, ch.ROBOT_DONE, *_FINAL, ch.TALLY, ch.STATUS}
 """Channels whose presence or content is evidence beyond their counters."""
 NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"

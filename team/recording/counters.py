@@ -30,7 +30,7 @@ class Counters:
             self._replies += 1
             return
         self._counters.append(sample.counter)
-        self._walls.append(sample.wall_ns if sample.wall_ns < LATEST_NS else LATEST_NS)
+        self._walls.append(min(sample.wall_ns, LATEST_NS))
 
     def findings(
         self, *, part: bool, numbered: bool = False, totals: Sequence[int] = ()

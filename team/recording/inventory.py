@@ -45,10 +45,7 @@ class Received:
         if sample.counter == NO_COUNTER or found is None or not _is_acknowledged(found[0]):
             return
         runs, counter, wall_ns = self._runs[sample.key], sample.counter, sample.wall_ns
-        if any(
-            run.first <= counter < run.end and run.first_ns <= wall_ns <= run.last_ns
-            for run in runs
-        ):
+        if any(r.first <= counter < r.end and r.first_ns <= wall_ns <= r.last_ns for r in runs):
             return
         if runs and runs[-1].end == counter and runs[-1].last_ns <= wall_ns:
             runs[-1].end, runs[-1].last_ns = counter + 1, wall_ns

@@ -45,16 +45,12 @@ def merged_metadata(logs: Sequence[Log]) -> dict[str, str]:
     files = [log.path.name for log in logs]
     if len(set(files)) < len(files):
         files = [f"{i}:{file}" for i, file in enumerate(files, 1)]
+    named = dict(zip(files, (log.metadata for log in logs), strict=True))
     merged: dict[str, str] = {}
-    for name in dict.fromkeys(chain.from_iterable(log.metadata for log in logs)):
-        values = {
-            f"{name}@{file}": log.metadata.get(name) for file, log in zip(files, logs, strict=True)
-        }
-        distinct = {value for value in values.values() if value is not None}
-        if len(distinct) == 1:
-            merged[name] = distinct.pop()
-        else:
-            merged |= {at: value for at, value in values.items() if value is not None}
+    for name in dict.fromkeys(chain.from_iterable(named.values())):
+        values = {f"{name}@{file}": own[name] for file, own in named.items() if name in own}
+        distinct = set(values.values())
+        merged |= values if len(distinct) > 1 else {name: distinct.pop()}
     return {**merged, MERGED: ", ".join(files)}
 
 

@@ -63,11 +63,8 @@ def check_continues(
         if (log.team, log.metadata.get("scenario")) != (team, metadata.get("scenario")):
             raise LogError(part, "exists, of another team or scenario", remedy)
     away_s = time.time() - part.stat().st_mtime
-    if (
-        not same_run
-        and away_s > LONGEST_AWAY_S
-        and not was_set_since({} if log is None else log.metadata)
-    ):
+    known = {} if log is None else log.metadata
+    if not same_run and away_s > LONGEST_AWAY_S and not was_set_since(known):
         what = f"exists, and is from {away_s / 3600:.1f} hours ago"
         raise LogError(path, what, f"{remedy}; --resume if it is of this run")
     if log is None or not _is_over(open_log(path), ends):

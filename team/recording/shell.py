@@ -91,9 +91,8 @@ class RecordLoop:
             if channel.recorded and channel is not ch.ALIVE:
                 bus.subscribe(channel, whole=True)
         orders = tuple(channel.name for channel in ch.ORDERS if channel.recorded)
-        bus.request(
-            ch.KEPT, "", m.KeptRequest(stamp_ns=0, channels=orders)
-        )  # their publisher may have left
+        request = m.KeptRequest(stamp_ns=0, channels=orders)  # their publisher may have left
+        bus.request(ch.KEPT, "", request)
         bus.watch_alive()
         bus.declare_alive(NODE)
 
@@ -198,24 +197,15 @@ class RecordLoop:
             kind, robot, incarnation = stream
             first, last = self._inventory.span(stream)
             _LOG.info("%s of %s are missing: asked for", f"{kind} {first} to {last}", robot)
-            if kind == "measurements":
-                requested = m.MeasurementsRequest(
-                    stamp_ns=self._newest_ns,
-                    robot=robot,
-                    incarnation=incarnation,
-                    first=first,
-                    last=last,
-                    only=True,
-                )
-                self._bus.request(ch.MEASUREMENTS, robot, requested)
-            else:
-                self._bus.request(
-                    ch.SENT,
-                    robot,
-                    m.SubmapsRequest(
-                        stamp_ns=self._newest_ns, robot=robot, incarnation=incarnation, first=first
-                    ),
-                )
+            wanted = m.SubmapsRequest(
+                stamp_ns=self._newest_ns, robot=robot, incarnation=incarnation, first=first
+            )
+            if kind == "submaps":
+                self._bus.request(ch.SENT, robot, wanted)
+                continue
+            fields = msgspec.structs.asdict(wanted)
+            requested = m.MeasurementsRequest(**fields, last=last, only=True)
+            self._bus.request(ch.MEASUREMENTS, robot, requested)
 
     @property
     def lacking(self) -> list[str]:
@@ -276,11 +266,10 @@ class RecordLoop:
         failure = () if self._failure is None else (f"nothing is recorded: {self._failure}",)
         absent = tuple(f"{node} has not appeared yet" for node in sorted(self._missing))
         lacking = tuple(f"{MISSING}{what}" for what in self.lacking) if last else ()
-        state = "done" if last else "recording"
         status = m.Status(
             stamp_ns=self._newest_ns,
             node=NODE,
-            state=state,
+            state="done" if last else "recording",
             figures=figures,
             warnings=(*failure, *absent, *lacking),
             run=self._run,

@@ -62,13 +62,13 @@ class ForeignKeys:
             raise BusError(f"no answer at {connect} ({patience_s:g} s): {error}") from None
         self._announced: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
+        liveliness = self._session.liveliness()
         self._first = [
-            reply.ok
+            _of_token(reply.ok)
             for token in tokens
-            for reply in self._session.liveliness().get(token, timeout=TOKENS_S)
+            for reply in liveliness.get(token, timeout=TOKENS_S)
             if reply.ok is not None
         ]
-        liveliness = self._session.liveliness()
         self._tokens: list[Any] = [
             liveliness.declare_subscriber(token, FifoChannel(CAPACITY)) for token in tokens
         ]
@@ -85,7 +85,7 @@ class ForeignKeys:
             for key in latched
         ]
         # For publishers whose cache answers on their own key, as in older versions.
-        self._cached = [
+        self._first += [
             _of_sample(reply.ok)
             for key in latched
             for reply in self._session.get(key, timeout=TOKENS_S)
@@ -136,12 +136,9 @@ class ForeignKeys:
 
     def _take_samples(self) -> list[ForeignSample]:
         """Return tokens first: they announce the types of the samples that follow."""
-        found = [_of_token(sample) for sample in self._first]
-        self._first.clear()
+        found, self._first = self._first, []
         for channel in self._tokens:
             found += [_of_token(sample) for sample in _some_of(channel)]
-        found += self._cached
-        self._cached = []
         for channel in self._samples:
             found += [_of_sample(sample) for sample in _some_of(channel)]
         return found

@@ -59,12 +59,9 @@ def examine(connect: str, keys: "Credentials | None", timeout_s: float = TIMEOUT
     except OSError as error:
         return Examined(waits_for=error.strerror or str(error))
     with link:
-        found = (
-            _examine_plain(link, connect)
-            if keys is None
-            else _examine_tls(link, host, connect, keys)
-        )
-    return replace(found, accepts=True)
+        if keys is None:
+            return replace(_examine_plain(link, connect), accepts=True)
+        return replace(_examine_tls(link, host, connect, keys), accepts=True)
 
 
 def _examine_tls(link: socket.socket, host: str, connect: str, keys: "Credentials") -> Examined:
