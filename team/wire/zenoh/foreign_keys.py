@@ -11,6 +11,7 @@ from zenoh.handlers import FifoChannel
 
 from teamslam.team.wire.bus import BusError
 
+PATIENCE_S = 10.0  # timeout [s] of the connection
 TOKENS_S = 5.0  # timeout [s] for the list of tokens that are present
 CAPACITY = 65_536
 """Capacity [messages] of a subscription. A full channel blocks Zenoh's thread, and the router then
@@ -42,14 +43,13 @@ class ForeignKeys:
         connect: str,
         keys: Sequence[str],
         tokens: Sequence[str],
-        patience_s: float = 10.0,
         latched: Sequence[str] = (),
     ) -> None:
         config = zenoh.Config()
         settings: dict[str, object] = {
             "mode": "client",
             "connect/endpoints": [connect],
-            "connect/timeout_ms": max(1, round(1e3 * patience_s)),
+            "connect/timeout_ms": round(1e3 * PATIENCE_S),
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "timestamping/enabled": True,  # required by the caches of latched keys
@@ -59,7 +59,7 @@ class ForeignKeys:
         try:
             self._session = zenoh.open(config)
         except zenoh.ZError as error:
-            raise BusError(f"no answer at {connect} ({patience_s:g} s): {error}") from None
+            raise BusError(f"no answer at {connect} ({PATIENCE_S:g} s): {error}") from None
         self._announced: dict[str, Any] = {}
         self._publishers: dict[str, Any] = {}
         liveliness = self._session.liveliness()
