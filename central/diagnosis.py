@@ -13,12 +13,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from teamslam.central.carried_off import OTHER_START, REMEDY, START_REMEDY, cuts_of
 from teamslam.central.monitor import SCALE_SIGMAS, finding
+from teamslam.central.withdrawal import SUSPICION, cost_share
 from teamslam.team import core
 from teamslam.team.config import MAP, UNNAMED
-from teamslam.team.estimation.contribution import Contribution, moment, named
-from teamslam.team.estimation.gaussian import UNSOLVABLE
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.contribution import Contribution, Stream, moment, named, part_of
+from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, information
+from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
 from teamslam.team.estimation.map_joining.hypotheses import (
     CARRIED_OFF,
     MOVED,
@@ -35,6 +37,7 @@ from teamslam.team.estimation.map_joining.marginals import (
     terms,
     unbounded_costs,
 )
+from teamslam.team.estimation.se2 import Pose, wrapped
 from teamslam.team.wire import messages as m
 
 SIGMAS = 4.0
@@ -54,6 +57,14 @@ MIRRORED_REMEDY = (
     "(counter-clockwise is positive)"
 )
 
+SEAM_DOF = 3.0
+"""Degrees of freedom of a seam."""
+
+REMEDY = "leave the robot on the ground, or restart its process where it is put down"
+START_REMEDY = "correct its initial pose by that, or remove it: a robot is joined without one"
+OTHER_START = "; two initial poses contradict each other, so {other}'s may be the wrong one"
+"""Of a team with two known initial poses: a majority would tell."""
+
 
 class _SharedError(NamedTuple):
     """A shared error of a robot's submaps: cause, least size, unit, words, remedy."""
@@ -61,6 +72,7 @@ class _SharedError(NamedTuple):
     cause: m.Cause
     least: float
     unit: str
+    subject: str
     positive: str
     negative: str
     remedy: str
@@ -73,11 +85,14 @@ MOST_SCALE = 100.0
 """Least covariance scale that no noise explains: sigmas ten times too small."""
 _CLOCK = "add {value:.3g} to its clock_offset_s"
 _ERRORS: Mapping[str, _SharedError] = {
-    "clock_offset": _SharedError("clock_offset", 0.02, " s", "late", "early", _CLOCK),
+    "clock_offset": _SharedError(
+        "clock_offset", 0.02, " s", "camera clock is", "late", "early", _CLOCK
+    ),
     "forward_scale": _SharedError(
         "odometry_scale",
         0.01,
         "",
+        "odometry is",
         "too short",
         "too long",
         "multiply its motion.forward_scale by {factor:.4g}",
@@ -86,6 +101,7 @@ _ERRORS: Mapping[str, _SharedError] = {
         "bearing_offset",
         0.01,
         " rad",
+        "bearings are",
         "to the left",
         "to the right",
         "add {value:.3g} to its sensor.bearing_offset",
@@ -94,6 +110,7 @@ _ERRORS: Mapping[str, _SharedError] = {
         "range_offset",
         0.05,
         " m",
+        "ranges are",
         "too long",
         "too short",
         "add {value:.3g} to its sensor.range_offset",
@@ -147,6 +164,50 @@ def diagnose(
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
     return (*found, *noise)
+
+
+def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:
+    """Describe the cuts of a fold, where a robot was carried off or slipped, with the motion in the
+    map's frame (x [m], y [m], turn [rad]) where both parts are in one island.
+
+    A part that lies where the odometry puts it was not carried off. With landmark names the fold
+    makes no cut; a hypothesis names the jump.
+    """
+    for cut in fold.cuts:
+        later = part_of(cut.stream, cut.after)
+        island = fold.island(*cut.stream)
+        place = island.state[island.graph.offset[island.graph.streams[cut.stream][-1]] :][:2]
+        by: tuple[float, ...] = ()
+        if fold.home.get(later, later) == fold.home[cut.stream]:
+            gap, chi2 = _gap(fold, cut.stream, later)
+            if cut.after == cut.before + 1 and cost_share(chi2, SEAM_DOF, SUSPICION) <= 1.0:
+                continue
+            if fold.island(*later).graph.first_sequence(later) == cut.after:
+                by = (float(gap[0]), float(gap[1]), wrapped(gap[2]))
+        yield m.Diagnosis(
+            cause="carried_off",
+            robot=cut.stream[0],
+            value=by,
+            evidence=cut.evidence,
+            remedy=REMEDY,
+            at_ns=cut.begin_ns,
+            place=(float(place[0]), float(place[1])),
+        )
+
+
+def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
+    island = fold.islands[fold.home[earlier]]
+    nodes = [island.graph.streams[earlier][-1], island.graph.streams[later][0]]
+    mean, covariance = joint_marginal(island, nodes)
+    gap = mean[3:] - mean[:3]
+    gap[2] = wrapped(gap[2])
+    J = np.hstack([-np.eye(3), np.eye(3)])
+    spread = dense.product(dense.product(J, covariance), J.T)
+    try:
+        metric = information(spread, "a seam")
+    except NotACovarianceError:
+        return gap, math.inf
+    return gap, float(dense.product(dense.product(gap, metric), gap))
 
 
 def _is_start(found: Hypothesis | m.Diagnosis) -> bool:
@@ -396,14 +457,6 @@ def _statement(found: m.Diagnosis) -> str:
             return _describe_shared_error(found)
 
 
-_SUBJECTS: Mapping[str, str] = {
-    "clock_offset": "camera clock is",
-    "odometry_scale": "odometry is",
-    "bearing_offset": "bearings are",
-    "range_offset": "ranges are",
-}
-
-
 def _describe_shared_error(found: m.Diagnosis) -> str:
     error = next(each for each in _ERRORS.values() if each.cause == found.cause)
     (value,), (sigma,) = found.value, found.sigma
@@ -411,7 +464,7 @@ def _describe_shared_error(found: m.Diagnosis) -> str:
     size = f"{abs(value):.3g} ± {sigma:.2g}{error.unit}"
     if found.cause == "odometry_scale":
         size = f"{100.0 * abs(value):.1f} ± {100.0 * sigma:.1f} %"
-    return f"{found.robot}'s {_SUBJECTS[found.cause]} {size} {words}"
+    return f"{found.robot}'s {error.subject} {size} {words}"
 
 
 def to_object(found: m.Diagnosis) -> dict[str, object]:

@@ -83,6 +83,7 @@ class CentralShell:
         self._shell.notes = self._awaited
         self._shell.refresh_by(self.node.refresh, FRESH_SHARE)
         self._lost: dict[str, Sample] = {}
+        """Tokens of lost robots that the node has not received."""
         self._since: dict[str, float] = {}
         self._alive: set[str] = set()
         self._stop = stop

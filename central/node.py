@@ -23,7 +23,7 @@ from teamslam.team.door import Door, absurd
 from teamslam.team.estimation.gaussian import NO_LANDMARKS
 from teamslam.team.pairs import RULES
 from teamslam.team.registry import load
-from teamslam.team.store import Stream, SubmapStore
+from teamslam.team.store import SubmapStore
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
@@ -163,34 +163,29 @@ class CentralNode:
     def file(self, message: m.Message) -> list[Outgoing]:
         """File a member; return its sender's credit, or the order to repeat."""
         match message:
-            case m.Submap():
-                return self._file_submap(message)
-            case m.SightingFactor():
-                return self._file_sighting(message)
+            case m.Submap() | m.SightingFactor():
+                return self._file_member(message)
             case m.Withdrawal():
                 return self._follow(message)
             case _:
                 self._warn_of_refusal(self.store.add(message))
                 return []
 
-    def _file_submap(self, submap: m.Submap) -> list[Outgoing]:
-        self._warn_of_refusal(self.store.add_submap(submap))
-        return self._credit_of(submap, self.store.acknowledged(_stream_of(submap)))
-
-    def _file_sighting(self, sighting: m.SightingFactor) -> list[Outgoing]:
-        """File an inter-robot measurement, the last of which completes its submap."""
-        stream = _stream_of(sighting)
+    def _file_member(self, member: m.Submap | m.SightingFactor) -> list[Outgoing]:
+        stream = member.robot, member.incarnation
         before = self.store.processed(stream)
-        self._warn_of_refusal(self.store.add_sighting(sighting))
+        self._warn_of_refusal(self.store.add(member))
         count = self.store.acknowledged(stream)
-        return self._credit_of(sighting, count) if count > before else []
+        is_counted = isinstance(member, m.Submap) or count > before
+        return self._credit_of(member, count) if is_counted else []
 
     def _refuse(self, message: m.Message, why: str) -> list[Outgoing]:
         if not isinstance(message, m.Submap | m.SightingFactor):
             return []
         self.store.refuse(message)
         self._warn_of_refusal(why)
-        return self._credit_of(message, self.store.processed(_stream_of(message)))
+        processed = self.store.processed((message.robot, message.incarnation))
+        return self._credit_of(message, processed)
 
     def _warn_of_refusal(self, reason: str | None) -> None:
         if reason is not None:
@@ -272,12 +267,14 @@ class CentralNode:
         return [*out, Outgoing(ch.FINAL_MAP, "", final)]
 
     def _conclude_anyway(self, why: str) -> list[Outgoing]:
-        newest = self._newest_map
-        if newest is None:
-            digest, now_ns = self.config_digest, self.attendance.now_ns
-            newest = fused_message(
-                self.config, digest, NO_LANDMARKS, (), stamp_ns=now_ns, joint=False
-            )
+        newest = self._newest_map or fused_message(
+            self.config,
+            self.config_digest,
+            NO_LANDMARKS,
+            (),
+            stamp_ns=self.attendance.now_ns,
+            joint=False,
+        )
         reasons = (*newest.reasons, f"not the final map, which raised: {why}")
         lost = tuple(self.attendance.missing())
         final = msgspec.structs.replace(
@@ -311,7 +308,7 @@ class CentralNode:
         """Request the submaps that robots have announced and no map can have."""
         if self.finished:
             return []
-        sent: dict[Stream, int] = {}
+        sent: dict[tuple[str, int], int] = {}
         for robot in self.attendance.robots.values():
             for each in (robot.progress, robot.done):
                 if each is not None:
@@ -373,11 +370,8 @@ class CentralNode:
             f"{robot} is given up: nobody waits for it, and the final map will be provisional"
             for robot in self.attendance.given_up
         ]
-        admitted = (
-            (f"admitted, though not in the scenario: {', '.join(self._admitted)}",)
-            if self._admitted
-            else ()
-        )
+        names = ", ".join(self._admitted)
+        admitted = [f"admitted, though not in the scenario: {names}"] if names else []
         return m.Status(
             stamp_ns=now_ns,
             node="central",
@@ -385,10 +379,6 @@ class CentralNode:
             figures=figures | dict(self.figures),
             warnings=(*given_up, *admitted, *self.findings, *self.warnings[-3:]),
         )
-
-
-def _stream_of(member: m.Submap | m.SightingFactor) -> Stream:
-    return member.robot, member.incarnation
 
 
 def node_class(config: CentralConfig) -> type[CentralNode]:

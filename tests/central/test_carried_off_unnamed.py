@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from teamslam.central.carried_off import cuts_of
+from teamslam.central.diagnosis import cuts_of
 from teamslam.central.tick_fold import TickFold
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.source import streams_of

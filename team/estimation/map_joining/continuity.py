@@ -7,7 +7,7 @@ landmarks is
     ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
 The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam
-inside a submap spoils it. Landmarks with identities: `central.carried_off`.
+inside a submap spoils it. Landmarks with identities: `central.diagnosis`.
 """
 
 import math
