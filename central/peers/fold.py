@@ -68,8 +68,9 @@ class PeerFold:
             last = [(d.incarnation, d.measurements) for d in statements if isinstance(d, m.Done)]
             if last:
                 incarnation, count = max(last)
-                end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
-                streams.append(end)
+                streams.append(
+                    m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+                )
         return self._give(m.End(stamp_ns=0, streams=tuple(streams)))
 
     def grow(self) -> list[Outgoing]:
@@ -124,20 +125,15 @@ class PeerFold:
 
     @property
     def _whole(self) -> bool:
-        return any(self._is_here(end) for end in self.centre.attendance.ends)
+        return any(all(map(self._has_stream, end.streams)) for end in self.centre.attendance.ends)
 
-    def _is_here(self, end: m.End) -> bool:
+    def _has_stream(self, end: m.StreamEnd) -> bool:
         replica = self._peer.replica
-        for each in end.streams:
-            done = replica.statements.get(each.robot, {}).get(("done", each.incarnation))
-            gone = ("given_up", 0) in replica.statements.get(each.robot, {})
-            if done is None or not isinstance(done.message, m.Done):
-                if not gone:
-                    return False
-                continue
-            if replica.share_of((each.robot, each.incarnation)).count < done.message.submaps:
-                return False
-        return True
+        statements = replica.statements.get(end.robot, {})
+        done = statements.get(("done", end.incarnation))
+        if done is None or not isinstance(done.message, m.Done):
+            return ("given_up", 0) in statements
+        return replica.share_of((end.robot, end.incarnation)).count >= done.message.submaps
 
     def conclusion(self, robot: str) -> m.Concluded | None:
         """Make the `Concluded` message for this peer's final map."""

@@ -168,12 +168,8 @@ class Peer:
 
     def counted(self, out: Sequence[Outgoing]) -> list[Outgoing]:
         """Count the messages of the set's channels."""
-        talk = (
-            each.message
-            for each in out
-            if each.channel in SET_CHANNELS or each.channel is ch.MEMBERS
-        )
-        self.uplink += sum(len(encoded(message)) for message in talk)
+        talk = [each for each in out if each.channel in (*SET_CHANNELS, ch.MEMBERS)]
+        self.uplink += sum(len(encoded(each.message)) for each in talk)
         return list(out)
 
     def grown(self) -> list[Outgoing]:

@@ -113,19 +113,12 @@ class PeerRobot(Peer):
         return found
 
     def _take_team_message(self, message: m.Message, sample: Sample) -> list[Outgoing] | None:
-        match message:
-            case m.StreamHead() if message.robot == self.robot:
-                return self._to_estimator(message, sample) + self._from_fold(
-                    self.fold.note(message)
-                )
-            case m.End():
-                return self._to_estimator(message, sample) + self._from_fold(
-                    self.fold.note(message)
-                )
-            case m.Liveliness() if message.node == ch.source_node(self.robot):
-                return self._to_estimator(message, sample)
-            case _:
-                return super()._take_team_message(message, sample)
+        own_head = isinstance(message, m.StreamHead) and message.robot == self.robot
+        if own_head or isinstance(message, m.End):
+            return self._to_estimator(message, sample) + self._from_fold(self.fold.note(message))
+        if isinstance(message, m.Liveliness) and message.node == ch.source_node(self.robot):
+            return self._to_estimator(message, sample)
+        return super()._take_team_message(message, sample)
 
     def _take(
         self, message: m.Message, sample: Sample, channel: ch.Channel | None, name: str
@@ -157,23 +150,19 @@ class PeerRobot(Peer):
         """Rename the fold's messages; hand the prior to the estimator first."""
         out: list[Outgoing] = []
         for each in messages:
-            channel = _OF_THE_FOLD.get(each.channel)
+            channel, message = _OF_THE_FOLD.get(each.channel), each.message
             if each.channel is ch.FAULT:
                 out.append(each)
             elif each.channel is ch.TEAM_END:
-                sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
-                out += self._to_estimator(each.message, sample)
-            elif isinstance(each.message, m.Withdrawal):
-                own = msgspec.structs.replace(each.message, by=f"the fold of {self.robot}")
-                if each.message.by == "central":
-                    out.append(Outgoing(ch.TEAM_WITHDRAWAL, self.robot, own))
-            elif channel is None or each.name not in ("", self.robot):
-                continue
-            else:
+                out += self._to_estimator(message, _sample_of(each))
+            elif isinstance(message, m.Withdrawal) and message.by == "central":
+                own = msgspec.structs.replace(message, by=f"the fold of {self.robot}")
+                out.append(Outgoing(ch.TEAM_WITHDRAWAL, self.robot, own))
+            elif channel is not None and each.name in ("", self.robot):
                 if channel is ch.TEAM_PRIOR:
-                    sample = Sample(each.key, encoded(each.message), each.message.stamp_ns, 0, -1)
-                    out += self._from_estimator(self.boundary.hand(self.node, each.message, sample))
-                out.append(Outgoing(channel, self.robot, each.message))
+                    handled = self.boundary.hand(self.node, message, _sample_of(each))
+                    out += self._from_estimator(handled)
+                out.append(Outgoing(channel, self.robot, message))
         if self.fold.finals > self._finals:
             self._finals = self.fold.finals
             concluded = self.fold.conclusion(self.robot)
@@ -191,3 +180,7 @@ class PeerRobot(Peer):
         state = "done" if self.final is not None else own.state
         figures = {**own.figures, **self.set_figures(), **figures}
         return msgspec.structs.replace(own, state=state, figures=figures, warnings=warnings)
+
+
+def _sample_of(out: Outgoing) -> Sample:
+    return Sample(out.key, encoded(out.message), out.message.stamp_ns, 0, -1)
