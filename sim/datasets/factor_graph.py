@@ -208,3 +208,14 @@ def _scans(edges: Sequence[PointEdge], at: Mapping[Key, int]) -> tuple[Scans, st
     single = first_of_each(scans.stamps_ns, scans.ids, scans.ranges > 0.0)
     lost = count_note(int((~single).sum()), "point", "dropped: repeated, or at the pose itself")
     return scans.where(single), lost
+
+
+def turn_covariance(
+    covariance: Float[np.ndarray, "*N 3 3"], theta: Float[np.ndarray, "*N"] | float
+) -> Float[np.ndarray, "*N 3 3"]:
+    """Covariance of a motion, from the axes of its start to those of its end."""
+    c, s = np.cos(theta), np.sin(theta)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    rows = np.stack([c, s, zero, -s, c, zero, zero, zero, one], axis=-1)
+    R = rows.reshape(*np.shape(theta), 3, 3)
+    return np.asarray(R @ covariance @ np.swapaxes(R, -1, -2))

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from teamslam.sim.datasets.tables import DatasetError, File
+from teamslam.sim.datasets.tables import DatasetError, File, open_place
 from teamslam.team.keys.roster import ROBOT
 
 ROBOT_NAME = ROBOT.pattern
@@ -30,18 +30,9 @@ class NoTablesError(DatasetError):
 @contextmanager
 def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
     """Open the folder, and each robot's by name; raises DatasetError."""
-    place = Path(path)
-    if not place.exists():
-        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
-    if place.is_dir():
-        yield place, _robots_in(place, path)
-        return
-    try:
-        with zipfile.ZipFile(place) as archive:
-            root = _root(zipfile.Path(archive))
-            yield root, _robots_in(root, path)
-    except zipfile.BadZipFile as error:
-        raise NoTablesError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
+    with open_place(path, EXPECTED, NoTablesError) as root:
+        inner = root if isinstance(root, Path) else _root(root)
+        yield inner, _robots_in(inner, path)
 
 
 def _root(archive: zipfile.Path) -> zipfile.Path:

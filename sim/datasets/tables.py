@@ -24,19 +24,28 @@ class MarkerError(DatasetError):
 
 
 @contextmanager
-def open_data_set(path: str, marker: str) -> Iterator[Mapping[str, File]]:
-    """Files by name in the one folder, within `path`, that holds `marker`."""
+def open_place(
+    path: str, expected: str, damaged: type[DatasetError] = DatasetError
+) -> Iterator[File]:
+    """Open a folder, or the content of a zip; damaged: error of a file that is none."""
     place = Path(path)
     if not place.exists():
-        raise DatasetError(f"{path}: no such file or folder; {EXPECTED}")
+        raise DatasetError(f"{path}: no such file or folder; {expected}")
     if place.is_dir():
-        yield _files_beside(place, marker, path)
+        yield place
         return
     try:
         with zipfile.ZipFile(place) as archive:
-            yield _files_beside(zipfile.Path(archive), marker, path)
+            yield zipfile.Path(archive)
     except zipfile.BadZipFile as error:
-        raise DatasetError(f"{path}: not a zip, or a damaged one ({error}); {EXPECTED}") from None
+        raise damaged(f"{path}: not a zip, or a damaged one ({error}); {expected}") from None
+
+
+@contextmanager
+def open_data_set(path: str, marker: str) -> Iterator[Mapping[str, File]]:
+    """Files by name in the one folder, within `path`, that holds `marker`."""
+    with open_place(path, EXPECTED) as root:
+        yield _files_beside(root, marker, path)
 
 
 EXPECTED = (

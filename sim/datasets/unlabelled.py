@@ -17,8 +17,8 @@ import numpy as np
 
 from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, CsvTable, matrices, read_table
 from teamslam.sim.datasets.detections_table import labels_of, scans_of
+from teamslam.sim.datasets.factor_graph import turn_covariance
 from teamslam.sim.datasets.folder_odometry import pace_notes
-from teamslam.sim.datasets.graph_lines import turn_covariance
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import (

@@ -2,15 +2,14 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.tables import RobotTables
-from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word
+from teamslam.sim.importing.columns import FUSED_WORDS, TRUTH_WORDS, has_word
+from teamslam.sim.importing.tables import Report, RobotTables
 from teamslam.team.datum import Datum
 from teamslam.team.ros2.bags import Bag, Topic, opened_bag
 from teamslam.team.ros2.decoding import (
@@ -246,22 +245,9 @@ def as_toml(found: Proposal) -> str:
     return "\n".join(lines)
 
 
-@dataclass
-class Imported:
-    """Tables of a bag's robots.
-
-    notes: topics used and omitted. messages: number read. datum: origin of fixes.
-    """
-
-    robots: list[RobotTables]
-    notes: list[str] = field(default_factory=list)
-    messages: int = 0
-    datum: Datum | None = None
-
-
 def import_bag(
     path: Path, topics: Topics | None, robot: str | None, datum: Datum | None = None
-) -> Imported:
+) -> Report:
     """Tables of a bag; raises BagError, UndecidedError.
 
     topics: None: from names and types. datum: where the topics give none; None: the first fix.
@@ -295,7 +281,7 @@ def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
                 )
 
 
-def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
+def _translated(bag: Bag, topics: Topics, path: Path) -> Report:
     translators = _translators(bag, topics)
     tables = {name: RobotTables(name) for name in topics.robots}
     robots_by_topic: dict[str, list[str]] = {}
@@ -338,7 +324,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Imported:
         tables[name].antenna = translator.antenna or (0.0, 0.0)
     has_fixes = any("fixes" in each.rows for each in tables.values())
     datum = topics.datum if has_fixes else None
-    return Imported(list(tables.values()), notes, sum(seen.values()), datum)
+    return Report(list(tables), notes, sum(seen.values()), list(tables.values()), datum)
 
 
 def _first_fix(bag: Bag, topics: Topics) -> Datum | None:

@@ -1,4 +1,4 @@
-"""Column maps from a user's columns to ours."""
+"""Column maps from a user's columns to ours, and words in names of files, columns and topics."""
 
 import re
 import tomllib
@@ -13,6 +13,33 @@ from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_files import ROBOT_NAME
 from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS
 from teamslam.sim.datasets.tables import DatasetError
+
+TRUTH_WORDS = (
+    "truth", "gt", "groundtruth", "true", "ref", "reference", "mocap", "optitrack", "vicon", "vrpn",
+    "qualisys",
+)  # fmt: skip
+"""Words for references, which are no measurements of the robot."""
+FUSED_WORDS = (
+    "filtered", "fused", "ekf", "ukf", "global", "map", "amcl", "gps", "slam", "localization",
+    "kiss", "visual", "vio", "lidar", "icp",
+)  # fmt: skip
+"""Words for odometry from more than wheels."""
+
+
+ROBOT_COLUMN = re.compile(
+    r"(robot|agent|vehicle|platform|rover|ugv)s?_?(id|name|no|nr|number|index|ns|namespace)?"
+)
+
+
+def names_robot(column: str) -> bool:
+    """Whether a column is called as one of robots' names."""
+    return ROBOT_COLUMN.fullmatch(re.sub(r"[^a-z0-9]+", "_", column.lower())) is not None
+
+
+def has_word(name: str, words: tuple[str, ...]) -> bool:
+    """Whether a name has such a word between marks or capitals."""
+    parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+    return not set(re.split(r"[^a-z]+", parts)).isdisjoint(words)
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -12,8 +12,15 @@ from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_files import ROBOT_NAME
 from teamslam.sim.datasets.folder_tables import DEGREE, POINTS, POLAR, POSES
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.columns import MEASURED, REQUIRED, TABLES
-from teamslam.sim.importing.words import FUSED_WORDS, TRUTH_WORDS, has_word, names_robot
+from teamslam.sim.importing.columns import (
+    FUSED_WORDS,
+    MEASURED,
+    REQUIRED,
+    TABLES,
+    TRUTH_WORDS,
+    has_word,
+    names_robot,
+)
 
 SYNONYMS: Mapping[str, str] = {
     "t_s": "t time times timestamp stamp sec secs seconds ts epoch unix unix_time header_stamp",

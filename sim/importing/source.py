@@ -38,7 +38,7 @@ from teamslam.sim.importing.proposal import (
     split_by_robot,
     write_proposal,
 )
-from teamslam.sim.importing.tables import RobotTables
+from teamslam.sim.importing.tables import Report, RobotTables
 from teamslam.sim.recorded.streams import measurements_in
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import open_data_set
@@ -70,20 +70,6 @@ class Request:
     ros2: Path | None = None
     truth: Path | None = None
     datum: Datum | None = None
-
-
-@dataclass
-class Report:
-    """Result of an import.
-
-    notes: used and omitted files and rows. messages: number read from bags. tables: of each robot,
-    for files and bags.
-    """
-
-    robots: list[str]
-    notes: list[str]
-    messages: int = 0
-    tables: Sequence[RobotTables] = ()
 
 
 def import_data(request: Request, folder: Path) -> Report:
@@ -312,13 +298,13 @@ def _bags(request: Request, folder: Path) -> Report:
             datum = found[-1].datum or datum
     except (BagError, TopicsError) as error:
         raise DatasetError(str(error)) from None
-    tables = [each for one in found for each in one.robots]
-    names = [each.robot for each in tables]
+    names = [name for one in found for name in one.robots]
     if len(set(names)) < len(names):
         raise DatasetError(
             f"two bags have the robots {', '.join(names)}: name them by [robots.NAME] in a file "
             "of topics, --ros2 FILE"
         )
+    tables = [each for one in found for each in one.tables]
     notes = [note for one in found for note in one.notes]
     report = _written(tables, notes, request, folder, datum)
     report.messages = sum(one.messages for one in found)

@@ -7,6 +7,7 @@ from pathlib import Path
 from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, CsvTable
 from teamslam.sim.datasets.folder_tables import POINT_COVARIANCE, POINTS, POSES, SPEEDS
 from teamslam.sim.datasets.folder_writer import Row, seconds, write_table
+from teamslam.team.datum import Datum
 from teamslam.team.ros2.translator import Measured, Pose, Position, Seen, Speeds
 
 
@@ -83,6 +84,21 @@ class RobotTables:
             write_table(
                 (folder if table == "landmarks" else place) / f"{table}.csv", columns, fitted
             )
+
+
+@dataclass
+class Report:
+    """Result of an import.
+
+    notes: used and omitted files and rows. messages: number read from bags. tables: of each robot,
+    for files and bags.
+    """
+
+    robots: list[str]
+    notes: list[str]
+    messages: int = 0
+    tables: Sequence[RobotTables] = ()
+    datum: Datum | None = None
 
 
 def _fit_row(row: Row, width: int) -> Row:

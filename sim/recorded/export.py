@@ -19,8 +19,8 @@ from teamslam.sim.datasets.factor_graph import (
     PointEdge,
     PoseEdge,
     place_by_odometry,
+    turn_covariance,
 )
-from teamslam.sim.datasets.graph_lines import turn_covariance
 from teamslam.sim.datasets.utias_writer import beyond_utias, write_utias
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,

@@ -18,9 +18,11 @@ Layout = Literal["uniform", "twins", "rooms"]
 Point = tuple[float, float]
 
 
-class SimulatedWorld(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="simulated"
-):
+class _World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
+    pass
+
+
+class SimulatedWorld(_World, frozen=True, tag="simulated"):
     """Square of side size_m with point landmarks; robots drive in steps of step_s seconds.
 
     visible_from_m and visible_to_m limit the *true* range: a gate on noisy measurements selects by
@@ -77,9 +79,7 @@ class SimulatedWorld(
                 raise ValueError(f"path {i} has no length: give two way-points or more")
 
 
-class UtiasWorld(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="utias"
-):
+class UtiasWorld(_World, frozen=True, tag="utias"):
     """Data set in the UTIAS MRCLAM format."""
 
     path: str = ""
@@ -96,20 +96,18 @@ class UtiasWorld(
             raise ValueError("start_sigma_m and start_sigma_rad are both 0 or both above 0")
 
 
-class FolderWorld(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="folder"
-):
-    """Data set in a folder (or zip) of CSV tables, one sub-folder per robot."""
-
+class _DataSet(_World, frozen=True):
     path: str = ""
     unknown_starts: tuple[str, ...] = ()
     duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     identities: Identities = "known"
 
 
-class LiveWorld(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="live"
-):
+class FolderWorld(_DataSet, frozen=True, tag="folder"):
+    """Data set in a folder (or zip) of CSV tables, one sub-folder per robot."""
+
+
+class LiveWorld(_World, frozen=True, tag="live"):
     """No world: drivers publish measurements and end streams.
 
     newcomer: configuration of unnamed robots.
@@ -119,33 +117,21 @@ class LiveWorld(
     newcomer: RobotConfig | None = None
 
 
-class UnlabelledWorld(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="unlabelled"
-):
+class UnlabelledWorld(_DataSet, frozen=True, tag="unlabelled"):
     """Data set of one robot with unnamed landmarks.
 
     Several robots each drive a piece of the log from an unknown initial pose.
     """
 
-    path: str = ""
-    unknown_starts: tuple[str, ...] = ()
-    duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     identities: Identities = "hidden"
     fixes: bool = False
 
 
-class GraphWorld(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="graph"
-):
+class GraphWorld(_DataSet, frozen=True, tag="graph"):
     """Landmark graph of isam, TORO, g2o or PyFactorGraph.
 
     More robots than the file's one each drive a piece; only the first has an initial pose.
     """
-
-    path: str = ""
-    unknown_starts: tuple[str, ...] = ()
-    duration_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
-    identities: Identities = "known"
 
 
 World = SimulatedWorld | UtiasWorld | FolderWorld | LiveWorld | UnlabelledWorld | GraphWorld

@@ -49,7 +49,7 @@ def test_live_and_as_a_bag_it_is_one_stream(tmp_path, use):
     topics = RobotTopics(odometry="/odom", detections=("/tags",), fixes="/fix", use=use)
     drove = drive()
     bag = ros.write_bag(tmp_path / "bag", drove)
-    (tables,) = import_bag(bag, Topics(robots={"r1": topics}, datum=DATUM), None).robots
+    (tables,) = import_bag(bag, Topics(robots={"r1": topics}, datum=DATUM), None).tables
     tables.start((1.0, 2.0, 0.5))
     tables.write(tmp_path / "set")
     robot = Driver(

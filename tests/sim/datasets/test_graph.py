@@ -6,8 +6,7 @@ from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.cli.main import _advice, app
-from teamslam.sim.datasets.graph import graph_world, read_pyfg
-from teamslam.sim.datasets.graph_lines import read_graph
+from teamslam.sim.datasets.graph import graph_world, read_graph, read_pyfg
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import run_team

@@ -7,8 +7,7 @@ from scipy.optimize import least_squares
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.datasets.folder_writer import write_folder
-from teamslam.sim.datasets.graph import read_pyfg
-from teamslam.sim.datasets.graph_lines import read_graph
+from teamslam.sim.datasets.graph import read_graph, read_pyfg
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.scenarios.toml import folder_scenario
