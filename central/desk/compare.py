@@ -29,7 +29,7 @@ MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
 
 
 def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
-    """Rows (figure, one cell per run), "–" for a missing figure."""
+    """Rows (figure, one cell per run)."""
     every = list(runs.values())
     columns = [_team_cells(run) for run in every]
     rows = [(name, tuple(of[name] for of in columns)) for name in (columns[0] if columns else ())]
@@ -122,7 +122,7 @@ def same_final_map(recorded: Evaluation, changed: Evaluation) -> bool:
 
 
 def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
-    """Largest distance [m] between a landmark's two positions; None without a common one."""
+    """Largest distance [m] between a landmark's two positions, if any is common."""
     if recorded.map is None or changed.map is None:
         return None
     _, a, b = np.intersect1d(recorded.map.ids, changed.map.ids, return_indices=True)
@@ -131,7 +131,7 @@ def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
 
 
 def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Draw two final maps with 95 % ellipses over the truth; False without a map.
+    """Draw two final maps with 95 % ellipses; False without a map.
 
     In an arbitrary frame the truth is aligned with the first map.
     """

@@ -29,7 +29,7 @@ BENT_RAD = 0.09
 
 
 def colour_of(number: int) -> str:
-    """Colour of a robot number as #rrggbb; the palette repeats."""
+    """Colour of a robot number as #rrggbb."""
     return ROBOT_COLOURS[number % len(ROBOT_COLOURS)]
 
 
@@ -39,10 +39,7 @@ def robot_colours(names: Iterable[str]) -> dict[str, str]:
 
 
 def robot_labels(names: Collection[str]) -> dict[str, str]:
-    """Legend entry of each robot; one common entry for more robots than colours.
-
-    An entry with an underscore is omitted by Matplotlib.
-    """
+    """Legend entry of each robot, or one for more robots than colours; Matplotlib omits "_"."""
     ordered = in_order(names)
     if len(ordered) <= len(ROBOT_COLOURS):
         return {name: name for name in ordered}
@@ -52,7 +49,7 @@ def robot_labels(names: Collection[str]) -> dict[str, str]:
 
 
 def curve_through(poses: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "N 2"]:
-    """Sample a curve through poses (x [m], y [m], theta [rad]) that follows their headings.
+    """Sample a curve through poses that follows their headings.
 
     It is the cubic closest to an arc, or the chord where the headings oppose along it.
     """
@@ -114,7 +111,7 @@ def draw_ellipses(
 
 
 def landmark_blocks(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "L 2 2"]:
-    """2 × 2 covariance of each landmark from the joint one, n = 2 L."""
+    """2 × 2 covariance of each landmark from the joint one."""
     at = np.arange(0, len(covariance), 2)
     rows = at[:, np.newaxis] + np.arange(2)
     blocks: Float[np.ndarray, "L 2 2"] = covariance[rows[:, :, np.newaxis], rows[:, np.newaxis, :]]

@@ -1,5 +1,4 @@
-"""Ledger of a log: the disposition of every measurement (law 1), each rejected one with its reason,
-and the maps of every submap.
+"""Ledger of a log: the disposition of every measurement (law 1), and the maps of every submap.
 
 The robot's node recomputes rejections. Measurements after the last submap are open if consumed,
 else lost.
@@ -36,10 +35,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Rejected:
-    """A rejected measurement; number: the robot's counter; kind: its message, as `observations`.
-
-    landmarks, teammates: those of a scan with identities, as far as it has them.
-    """
+    """A rejected measurement; number: the robot's counter; kind: its message, as `observations`."""
 
     robot: str
     incarnation: int
@@ -53,7 +49,7 @@ class Rejected:
 
 @dataclass(frozen=True)
 class Outliers:
-    """Number of detections of used scans that the window of a submap rejected as outliers."""
+    """Number of detections that the window of a submap rejected as outliers."""
 
     robot: str
     incarnation: int
@@ -181,7 +177,6 @@ def _submaps_of(log: Recorded, stream: Stream) -> tuple[list[m.Submap], list[str
 def _entries(
     log: Recorded, stream: Stream, submaps: list[m.Submap]
 ) -> tuple[tuple[Entry, ...], list[str]]:
-    """Entry of every existing or announced measurement, and violations."""
     measurements: Mapping[int, m.Measurement] = log.measurements.get(stream, {})
     count = max(log.published.get(stream, 0), max(measurements, default=-1) + 1)
     if count > max(MOST_LOST, MOST_LOST_SHARE * len(measurements)):

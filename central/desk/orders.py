@@ -69,10 +69,7 @@ class RunningTeam:
                 yield message
 
     def await_robot(self, robot: str | None = None) -> None:
-        """Wait for a centre or peer, and for a message of the robot.
-
-        Raises WithdrawError or NoRobotError after CENTRE_S.
-        """
+        """Wait CENTRE_S for a centre or peer and the robot. Raises WithdrawError, NoRobotError."""
         until = time.monotonic() + CENTRE_S
         while time.monotonic() < until:
             for _ in self.messages(LOOK_S):
@@ -102,10 +99,7 @@ def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
 def withdraw(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> m.FusedMap:
-    """Order a robot's withdrawal and return the first map without it.
-
-    Raises WithdrawError if nobody can withdraw it, or on timeout.
-    """
+    """Order a robot's withdrawal and return the first map without it. Raises WithdrawError."""
     team = RunningTeam(bus)
     team.await_robot(robot)
     order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)
@@ -123,9 +117,8 @@ def withdraw(
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> None:
-    """Order the team to continue without a lost robot; return on confirmation.
-
-    Raises WithdrawError if nobody confirms.
+    """Order the team to continue without a lost robot; return on confirmation. Raises
+    WithdrawError.
     """
     team = RunningTeam(bus, ch.STATUS)
     team.await_robot(robot)
@@ -144,10 +137,7 @@ def give_up(
 
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
-    """Order a live team to end; return when the centre repeats the order or a peer follows.
-
-    Raises WithdrawError for a team with a world, or if nobody confirms.
-    """
+    """Order a live team to end; return on confirmation. Raises WithdrawError."""
     team = RunningTeam(bus, ch.TEAM_END)
     team.await_robot()
     if bus.is_alive("world"):
@@ -184,10 +174,10 @@ def judge(
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:
-    """Publish a verdict on two unnamed landmarks; return the first map that includes it.
+    """Publish a verdict on two unnamed landmarks, or its withdrawal; return the first map with
+    it.
 
-    withdrawn: withdraw the verdict. Raises NoRobotError for an unknown robot, WithdrawError if
-    nobody confirms.
+    Raises NoRobotError, WithdrawError.
     """
     team = RunningTeam(bus)
     robot = judgement.first.robot

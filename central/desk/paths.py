@@ -23,7 +23,7 @@ from teamslam.team.wire.arrays import floats, stamps
 
 @dataclass(frozen=True)
 class SmoothedPath:
-    """Poses (x [m], y [m], theta [rad]) in the final map by ascending stamp, with covariances.
+    """Poses (x [m], y [m], theta [rad]) in the final map by ascending stamp.
 
     at_keyframes: includes poses between submap ends.
     """
@@ -90,9 +90,8 @@ def _between_ends(
 
 
 def _join_parts(parts: list[SmoothedPath]) -> SmoothedPath:
-    """Join the parts by strictly ascending stamp.
-
-    A window's end, which the final map has, precedes a keyframe of the next window at that stamp.
+    """A window's end, which the final map has, precedes a keyframe of the next window at that
+    stamp.
     """
     arrays = zip(*((part.stamps_ns, part.poses, part.covariances) for part in parts), strict=True)
     stamps, poses, covariances = map(np.concatenate, arrays)

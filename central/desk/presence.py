@@ -21,10 +21,7 @@ DRIFT = 0.1
 
 @dataclass
 class Member:
-    """One node.
-
-    clock_s: team time less the machine's wall clock; drift: its change per second.
-    """
+    """One node; clock_s: team time less the wall clock; drift: its change per second."""
 
     alive: bool = False
     status: m.Status | None = None

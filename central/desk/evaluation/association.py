@@ -61,11 +61,10 @@ class Pairs:
 class AssociationResult:
     """Association scores: over all detections, inside windows, and of the map.
 
-    label_of: label of each unnamed landmark, or UNKNOWN. duplicates: landmarks beyond the first of
-    a label; confirmed: with at least two submaps; shown: in the final map. merges_right,
-    merges_wrong: pairs of robots that share landmarks, by whether half of those labelled by both
-    agree. merges_refused: pending attempts. left_out: labelled detections in no submap.
-    clutter_in_map: unlabelled ones in a submap.
+    label_of: of each unnamed landmark, or UNKNOWN. duplicates: landmarks beyond the first of a
+    label; confirmed: with at least two submaps; shown: in the final map. merges_right: pairs of
+    robots that share landmarks, half of which agree by label. merges_refused: pending attempts.
+    left_out: labelled detections in no submap. clutter_in_map: unlabelled ones in a submap.
     """
 
     pairs: Pairs
@@ -83,7 +82,7 @@ class AssociationResult:
 
 
 def association_result(log: Collected) -> AssociationResult | None:
-    """Compute the scores; None without labelled detections without identities."""
+    """Compute the scores; None without labels."""
     labels = _labels(log)
     if all(label == UNKNOWN for label in labels.values()):
         return None
@@ -176,7 +175,6 @@ def _pairs(
     landmark: Int64[np.ndarray, " n"],
     window: Int64[np.ndarray, " n"] | None = None,
 ) -> Pairs:
-    """Count pairs of labelled detections; with windows, inside one only."""
     window = np.zeros(len(label), np.int64) if window is None else window
     used = landmark >= 0
     real = _choose_two(np.column_stack((window, label)))

@@ -3,7 +3,7 @@
 A landmark measured at t_i and t_j is at points b_i, b_j in the base frame. With the odometry motion
 D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise. Sensor mount, range offset, odometry
 scales and drift are estimated jointly. The variance is the sandwich over stretches of time (Liang
-and Zeger 1986), which allows for correlation within a stretch.
+and Zeger 1986).
 """
 
 import math
@@ -53,8 +53,7 @@ class Timed:
     """Stamps, motions and measurements of named landmarks of one stream, in any order.
 
     motions: per interval (forward [m/s], left [m/s], turn [rad/s]), or (wheel speed [m/s], steering
-    [rad], –) if `steered`. seen: (range [m], bearing [rad]) per measurement. has_points: whether
-    some were sent as points.
+    [rad], –) if `steered`. seen: (range [m], bearing [rad]) per measurement.
     """
 
     ends_ns: "array[int]" = field(default_factory=lambda: array("q"))
@@ -141,10 +140,7 @@ def is_refuted(cause: m.Diagnosis, found: Late | None) -> bool:
 
 
 def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | None:
-    """Warn about groups of robots whose measurement times do not overlap.
-
-    spans_ns: first and last measurement time by robot.
-    """
+    """Warn about groups of robots whose spans of measurement times do not overlap."""
     groups: list[list[str]] = []
     until_ns = 0
     for robot in sorted(spans_ns, key=lambda each: spans_ns[each]):
@@ -178,8 +174,8 @@ def _time(stamp_ns: int) -> str:
 def lateness(timed: Timed, config: RobotConfig) -> Late | None:
     """Estimate a robot's delay beyond its `clock_offset_s`; None if undetermined.
 
-    Gauss–Newton under Huber's loss; σ is divided by the slope of the step in τ, which derivative
-    noise reduces.
+    Gauss–Newton under Huber's loss; σ is divided by the slope of the step in τ, which noise of the
+    derivative reduces.
     """
     if not timed.ends_ns or not timed.ids:
         return None
@@ -204,15 +200,12 @@ def lateness(timed: Timed, config: RobotConfig) -> Late | None:
 
 @dataclass(frozen=True)
 class _DeadReckoning:
-    """Path by odometry alone: pose at the start of each interval, and twist per second."""
-
     starts_ns: Int64[np.ndarray, " n"]
     ends_ns: Int64[np.ndarray, " n"]
     rates: Float[np.ndarray, "n 3"]
     poses: Float[np.ndarray, "n 3"]
 
     def at(self, stamps_ns: Int64[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
-        """Poses at these times; constant between intervals."""
         k = np.maximum(np.searchsorted(self.starts_ns, stamps_ns, "right") - 1, 0)
         seconds = 1e-9 * (np.minimum(stamps_ns, self.ends_ns[k]) - self.starts_ns[k])
         return _after(self.poses[k], self.rates[k] * np.maximum(seconds, 0.0)[:, np.newaxis])
@@ -220,7 +213,7 @@ class _DeadReckoning:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of measurements of one landmark, at base points b_i and b_j, and their time stretch."""
+    """Pairs of measurements of one landmark at base points b_i, b_j, and their time stretch."""
 
     path: _DeadReckoning
     t_i: Int64[np.ndarray, " k"]
@@ -253,7 +246,7 @@ class Pairs:
 
     @property
     def gaps(self) -> Float[np.ndarray, " k"]:
-        """Distance of b_j from its place by the odometry, relative to NEAR_M or the range."""
+        """Distance of b_j from its place by the odometry, relative to max(range, NEAR_M)."""
         gaps = self.b_j - self._again(0)
         found: Float[np.ndarray, " k"] = np.hypot(*gaps.T) / np.maximum(
             np.hypot(*self.b_j.T), NEAR_M
@@ -305,7 +298,6 @@ def _dead_reckoning(timed: Timed, config: RobotConfig) -> _DeadReckoning:
 
 
 def _on_base(seen: Float[np.ndarray, "k 2"], sensor: Sensor) -> Float[np.ndarray, "k 2"]:
-    """Measured points in the base frame, with the sensor's calibration and mount."""
     x, y, heading = sensor.mount
     ranges = (seen[:, 0] - sensor.range_offset) / sensor.range_scale
     angles = seen[:, 1] - sensor.bearing_offset + heading

@@ -18,14 +18,14 @@ BAND = 0.95
 
 @dataclass(frozen=True)
 class Path:
-    """Poses (x [m], y [m], theta [rad]) by ascending stamp, true or estimated."""
+    """Poses (x [m], y [m], theta [rad]) by ascending stamp."""
 
     stamps_ns: Int64[np.ndarray, " K"]
     poses: Float[np.ndarray, "K 3"]
 
 
 def join_batches(batches: Sequence[Path]) -> Path:
-    """Join batches to one path by stamp, with the first pose of equal stamps."""
+    """Join batches to one path by stamp; the first of equal stamps counts."""
     if not batches:
         return Path(np.zeros(0, np.int64), np.zeros((0, 3)))
     stamps = np.concatenate([batch.stamps_ns for batch in batches])
@@ -41,8 +41,7 @@ SMALL_TURN = 1e-6
 class PoseErrors:
     """Estimate − truth of the K poses with truth, (x [m], y [m], theta [rad]).
 
-    sigmas: estimated standard deviations. nees: eᵀ P⁻¹ e with 3 degrees of freedom. motion_nees:
-    that of the rigid motion from the estimate to the truth.
+    nees: eᵀ P⁻¹ e with 3 degrees of freedom. motion_nees: of the motion from estimate to truth.
     """
 
     stamps_ns: Int64[np.ndarray, " K"]
@@ -76,9 +75,9 @@ class PoseErrors:
 class MapErrors:
     """Map errors against the true positions of the same landmarks.
 
-    rmse_m: unaligned; aligned_rmse_m: after the rigid motion truth_from_map. nees_per_dof: joint,
-    unaligned, 2L degrees of freedom; `band`: its 95 % interval for one run. shape: non-rigid
-    errors. coverage: share of landmarks in their 95 % ellipse, unaligned.
+    aligned_rmse_m: after the rigid motion truth_from_map; all others unaligned. nees_per_dof:
+    joint, 2L degrees of freedom; `band`: its 95 % interval for one run. coverage: share of
+    landmarks in their 95 % ellipse.
     """
 
     count: int
@@ -106,7 +105,6 @@ class ShapeErrors:
     """Map errors without their rigid part, with that part's covariance removed.
 
     nees_per_landmark: NEES of the 2L − 3 degrees of freedom, scaled to an expectation of 2.
-    coverage: share of landmarks in their 95 % ellipse.
     """
 
     nees_per_landmark: float
@@ -155,10 +153,9 @@ def _shape_errors(
     truth: Float[np.ndarray, "L 2"],
     truth_from_map: Float[np.ndarray, "3"],
 ) -> ShapeErrors:
-    """Compute the errors after alignment, in the map frame.
+    """With G = ∂(positions)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g).
 
-    With G = ∂(positions)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g); the covariance of the
-    remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
+    The covariance of the remaining error is Π P Π with Π = I − G (GᵀG)⁻¹ Gᵀ.
     """
     count = len(means)
     error = (means - transform_points(between(truth_from_map, np.zeros(3)), truth)).ravel()
@@ -189,10 +186,7 @@ def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m 
 def rigid_alignment(
     truth: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3"] | None:
-    """truth_from_points by least squares without scale (Kabsch 1976; Umeyama 1991).
-
-    None below two distinct points.
-    """
+    """truth_from_points by least squares without scale (Umeyama 1991); None below two points."""
     if len(points) < NEEDED or np.ptp(points, axis=0).max() == 0.0:
         return None
     return procrustes(truth, points, np.ones(len(points)))
@@ -219,8 +213,7 @@ def interpolate_truth(
 ) -> tuple[Float[np.ndarray, "K 3"], Bool[np.ndarray, " K"]]:
     """Interpolate the true poses at the stamps; return poses and a mask of known rows.
 
-    Positions linearly, headings by the shorter arc; unknown outside the truth and in gaps above
-    TRUTH_GAP_NS.
+    Headings by the shorter arc; unknown outside the truth and in gaps above TRUTH_GAP_NS.
     """
     poses = np.zeros((len(stamps_ns), 3))
     if not len(truth.stamps_ns):
@@ -266,8 +259,7 @@ def _motion_nees(
 ) -> Float[np.ndarray, " K"]:
     """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, which allows for rotation about a far point.
 
-    If the map rotates about its origin by δ, a pose at distance d errs by d δ²/2 radially. ξ = (V⁻¹
-    (p' − R p), δ) with V of the SE(2) exponential; A = [1 0 y; 0 1 −x; 0 0 1].
+    ξ = (V⁻¹ (p' − R p), δ) with V of the SE(2) exponential; A = [1 0 y; 0 1 −x; 0 0 1].
     """
     turn = on_circle(truth[:, 2] - poses[:, 2])
     p = poses[:, 0] + 1j * poses[:, 1]
@@ -284,11 +276,10 @@ def _motion_nees(
 
 @dataclass(frozen=True)
 class TrajectoryErrors:
-    """RMS over poses with truth [m], [rad]; rigid alignment without scale.
+    """RMS over poses with truth [m], [rad]; alignment without scale.
 
-    ape_m, ape_rad: absolute, unaligned (evo: -r trans_part, angle_rad). ape_aligned_m,
-    ape_aligned_rad: after the best position alignment (evo: -a). rpe_m, rpe_rad: motion between
-    consecutive poses (evo: --delta 1 --delta_unit f).
+    ape: absolute (evo: -r trans_part, angle_rad); aligned: after the best position alignment (-a).
+    rpe: motion between consecutive poses (--delta 1 --delta_unit f).
     """
 
     poses: int

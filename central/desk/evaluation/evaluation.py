@@ -134,7 +134,6 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
 def _examine_streams(
     log: Collected,
 ) -> tuple[tuple[m.Diagnosis, ...], dict[str, Late], tuple[str, ...]]:
-    """Find mirrored robots, delays and separate times in the measurements alone."""
     longest: dict[str, Timed] = {}
     spans: dict[str, tuple[int, int]] = {}
     configs = {robot: _config(log, robot) for robot, _ in log.timed}
@@ -211,7 +210,7 @@ def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | 
 
 
 def _aligned(robot: RobotResult, team_motion: TeamMotion | None) -> RobotResult:
-    """Add the aligned errors; without a motion of the team the robot's own path is aligned."""
+    """Add the aligned errors, without a motion of the team by the robot's own path."""
     motion, alignment = team_motion or (_motion([robot]), "trajectory")
     aligned = None if motion is None else _moved_rmse(motion, robot.smoothed_path, robot.truth)
     online = None
@@ -262,7 +261,7 @@ Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
 
 
 def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
-    """Median distance [m] of smoothed poses from the other sensor's positions, or None.
+    """Median distance [m] of smoothed poses from the other sensor's positions.
 
     Fits one rigid motion, lever arm and time shift per team by least absolute distances.
     """

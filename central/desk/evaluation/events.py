@@ -1,4 +1,4 @@
-"""Detect a team's events: robots that join, are lost or refused, and warnings."""
+"""Detect a team's events."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -211,7 +211,7 @@ def decision_words(decision: m.AssociationDecision) -> str:
 
 
 def is_awaited(warning: str) -> bool:
-    """Whether a warning is a start-up state of a node."""
+    """Whether a warning is a start-up state."""
     return any(text in warning for text in _AWAITED)
 
 

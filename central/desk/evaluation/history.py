@@ -1,4 +1,4 @@
-"""History of a run over team time: consistency, latency, events."""
+"""History of a run over team time."""
 
 from array import array
 from bisect import bisect_left
@@ -67,7 +67,7 @@ class History:
     """History of a run by team time.
 
     start_ns, end_ns: span of the measurements, else of all messages. map_nees: per degree of
-    freedom of every fused map, in blocks.
+    freedom.
     """
 
     start_ns: int
@@ -199,7 +199,7 @@ class _Gathering:
 
 
 def history(samples: Iterable[Sample]) -> History:
-    """Compute the history of a run from its samples in log order."""
+    """Compute the history of a run from its samples."""
     found = _Gathering()
     centre = PeersAsCentre()
     for sample in samples:

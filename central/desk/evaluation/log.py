@@ -1,7 +1,6 @@
 """Collect a log's contents for an evaluation, in one pass.
 
-Measurements, most of a log, are counted by head (robot, incarnation, measurement) and added to
-their stream's `Timed`. All other messages are decoded and checked by `open_printable`.
+Measurements, most of a log, are counted by head and added to their stream's `Timed`.
 """
 
 from collections import defaultdict
@@ -80,8 +79,8 @@ class Measurements:
 class Collected:
     """Contents of a log by channel and robot.
 
-    samples: by key, decoded on demand. timed: by (robot, incarnation). first_ns: wall clock of the
-    first sample that has one. disagreement: peers whose final map differs, as text.
+    samples: by key, decoded on demand. first_ns: wall clock of the first sample that has one.
+    disagreement: peers whose final map differs, as text.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))

@@ -9,7 +9,7 @@ from teamslam.team.shapes import Float, Int64
 
 @dataclass(frozen=True)
 class Matching:
-    """Number of landmarks within `gate_m` of a true one, one to one, `of` all unnamed ones."""
+    """Number of landmarks within `gate_m` of a true one, one to one."""
 
     gate_m: float
     matched: int
@@ -63,7 +63,7 @@ def gospa(
 ) -> Gospa:
     """GOSPA of points in the true frame (Rahmathullah, García-Fernández and Svensson 2017).
 
-    With p = 2, α = 2 and pairs nearer than the cut-off c, GOSPA² = Σ d² + c²/2 · (missed + false).
+    With p = 2, α = 2 and cut-off c, GOSPA² = Σ d² + c²/2 · (missed + false).
     """
     assigned = assign(found, true, cut_off_m)[2]
     missed, false = len(true) - len(assigned), len(found) - len(assigned)

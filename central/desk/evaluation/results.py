@@ -1,7 +1,4 @@
-"""Results of a run: its map, its robots and its traffic.
-
-A figure without its inputs is None. Metres and radians; NEES per degree of freedom.
-"""
+"""Results of a run in metres and radians; a figure without its inputs is None."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -39,9 +36,8 @@ def figure(of: object, path: str) -> Any:
 class Consumption:
     """Dispositions of the measurements on a robot's sensor channels.
 
-    steps: odometry intervals. published: distinct measurements. consumed, ledger: from the robot's
-    `Done`. each_once: no measurement is in two submaps, and the ledger sums to consumed. gated:
-    detections that windows rejected as outliers.
+    steps: odometry intervals. consumed, ledger: from the robot's `Done`. each_once: no measurement
+    is in two submaps, and the ledger sums to consumed. gated: detections rejected as outliers.
     """
 
     steps: int
@@ -103,9 +99,9 @@ class PeerResult:
 class MapResult:
     """Final map: L landmarks by id and their covariance (blocks unless `joint`).
 
-    truth: true positions, zero unless `known`, whose errors count. cost_per_dof: χ² of the join.
-    covariance_scale: factor to apply to submap covariances. matching: of unnamed landmarks.
-    changes: against saved maps. diagnosis: causes of misfit, best first.
+    truth: true positions, zero unless `known`. covariance_scale: factor to apply to submap
+    covariances. matching: of unnamed landmarks. changes: against saved maps. diagnosis: causes of
+    misfit, best first.
     """
 
     rule: str
@@ -135,10 +131,10 @@ class MapResult:
 class RobotResult:
     """One robot: dispositions of its measurements, and its poses against the truth.
 
-    smoothed: final map's poses at submap ends. online: poses published during the run, on
-    "team/pose", "central/pose" or "own/pose" (`online_channel`). aligned: after the rigid motion
-    that aligns the map (`alignment`: "map"), or all smoothed paths ("paths"), or the robot's own
-    path ("trajectory"). own_map: unaligned. outside: running poses are not in the team's frame.
+    smoothed: at submap ends, from the final map. online: published during the run. aligned: after
+    the rigid motion that aligns the map (`alignment`: "map"), or all smoothed paths ("paths"), or
+    the robot's own path ("trajectory"). own_map: unaligned. outside: running poses are not in the
+    team's frame.
     """
 
     consumption: Consumption
@@ -173,10 +169,10 @@ class RobotResult:
 class Evaluation:
     """A run: scenario, map, robots and traffic.
 
-    notes: remarks of the world, and messages set aside (number: faults). unsound: number of invalid
-    samples. arbitrary_frame: only aligned errors are meaningful. mirrored, lateness: by the
-    measurements alone. recorded_ns: wall time of the first message. truth_from_map: aligns the
-    landmarks with the true ones, or the paths.
+    notes: remarks of the world, and messages set aside (number: faults). arbitrary_frame: only
+    aligned errors are meaningful. mirrored, lateness: by the measurements alone. recorded_ns: wall
+    time of the first message. truth_from_map: aligns the landmarks with the true ones, or the
+    paths.
     """
 
     scenario: TeamConfig | None

@@ -1,7 +1,7 @@
 """Export a run as a ROS 2 bag for RViz, Foxglove and evo.
 
 Dead-reckoned odometry with odom → base, the messages of `teamslam.team.ros2_answers`, the smoothed
-path as stamped poses, and the truth, if known, with world → map. Log times are team time.
+path, and the truth, if known, with world → map. Log times are team time.
 """
 
 from collections.abc import Iterator
@@ -73,7 +73,7 @@ class _Robot:
 
 
 def answers_of(log: Log) -> Iterator[Answer]:
-    """Convert a log to ROS 2 messages, in log order; then the smoothed and the true poses."""
+    """Convert a log to ROS 2 messages; at last the smoothed and the true poses."""
     robots: dict[str, _Robot] = {}
     team = Answers(Names(TEAM_SPACE))
     final = False
@@ -111,7 +111,7 @@ def _smoothed(log: Log) -> Iterator[Answer]:
 
 
 def _true(log: Log) -> Iterator[Answer]:
-    """True poses in `world`, and world → map: where the map's frame is arbitrary, by alignment."""
+    """True poses in `world`, and world → map, in an arbitrary frame by alignment."""
     evaluation = evaluate(log.samples())
     starts_ns = list[int]()
     for robot, result in evaluation.robots.items():
@@ -132,10 +132,7 @@ def _true(log: Log) -> Iterator[Answer]:
 
 
 def export_rosbag2(log: Log, folder: Path) -> dict[str, int]:
-    """Write a bag (MCAP) into a new folder; return message counts by topic.
-
-    Raises LogError for a log without odometry or poses.
-    """
+    """Write a bag (MCAP) into a new folder; return message counts by topic. Raises LogError."""
     counts = dict[str, int]()
     with new_bag(folder) as bag:
         for answer in answers_of(log):

@@ -1,7 +1,4 @@
-"""Write a run's map and paths as tables in common formats.
-
-Metres, seconds, radians, in the frame that the map names; numbers have all digits.
-"""
+"""Write a run's map and paths as tables in common formats: metres, seconds, radians, all digits."""
 
 import csv
 import json
@@ -118,7 +115,6 @@ def measurement_counts(found: Recorded) -> Mapping[int, int]:
 
 
 def _members(found: Recorded) -> Iterator[tuple[Member, int]]:
-    """Submap landmarks in the final map, each with its number there."""
     for fused in found.of(m.FusedMap, ch.FINAL_MAP)[-1:]:
         for of in fused.memberships:
             columns = [ids(each, "members") for each in (of.sequences, of.locals, of.identities)]
@@ -140,11 +136,7 @@ def write_map(
     datum: Datum | None = None,
     classes: Mapping[int, tuple[str, float]] = NO_CLASSES,
 ) -> list[FilePath]:
-    """Write map.csv and map.json; return the files.
-
-    Covariances are 2 × 2 blocks. The count of an unnamed landmark is absent if no submap reports
-    it.
-    """
+    """Write map.csv and map.json with 2 × 2 covariances; return the files."""
     rows: list[dict[str, Any]] = []
     blocks = landmark_blocks(fused.covariance)
     for landmark, (x, y), block in zip(
@@ -187,10 +179,7 @@ def write_map(
 def write_geojson(
     fused: MapResult, paths: Mapping[str, SmoothedPath], folder: FilePath, datum: Datum
 ) -> FilePath:
-    """Write map.geojson (RFC 7946): landmarks as points, paths as lines; return the file.
-
-    sigma_m: larger semi-axis of the 1 sigma ellipse.
-    """
+    """Write map.geojson (RFC 7946); return it. sigma_m: larger semi-axis of the 1σ ellipse."""
     places = geodetic_from_local(datum, fused.means)[:, ::-1].tolist()
     sigmas = np.sqrt(np.linalg.eigvalsh(landmark_blocks(fused.covariance))[:, 1]).tolist()
     features = [

@@ -36,8 +36,7 @@ def seconds(stamp_ns: int) -> str:
 def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:
     """Write r1.smoothed.tum, r1.online.tum and r1.truth.tum of every robot; return the files.
 
-    With truth, r1.smoothed.truth.tum and r1.online.truth.tum hold the true poses at the path's
-    stamps.
+    r1.smoothed.truth.tum and r1.online.truth.tum hold the true poses at the path's stamps.
     """
     written = []
     folder.mkdir(parents=True, exist_ok=True)

@@ -180,10 +180,7 @@ def _draw_paths(
     dense: SmoothedPath | None,
     apart: bool,
 ) -> None:
-    """Draw the true path with its start, and the smoothed or else the online path.
-
-    apart: the online path is not in the map frame, so it is omitted.
-    """
+    """apart: the online path is not in the map frame, so it is omitted."""
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
     line = smoothed if dense is None else _thinned(Path(dense.stamps_ns, dense.poses))
     known = truth if len(truth.stamps_ns) else line
@@ -267,7 +264,7 @@ def _state(changes: Mapping[int, m.LandmarkChange], landmark: int) -> str:
 def _draw_changes(
     axis: "Axes", fused: MapResult, changes: Mapping[int, m.LandmarkChange]
 ) -> Float[np.ndarray, "L 2"]:
-    """Mark the landmarks that are not as the saved maps have them; return each one's place.
+    """Mark changes since the saved maps; return each landmark's place.
 
     As on the live page: an arrow from a moved one's old place to a ring, a hollow dashed mark at
     that of one that is gone, a square around a new one.

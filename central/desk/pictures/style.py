@@ -121,7 +121,7 @@ def save(figure: "Figure", path: Path) -> None:
 
 
 def _resize(figure: "Figure", width_in: float | None) -> None:
-    """Scale a figure to a width: lines and markers shrink, text has PAPER_PT, labels POINT_PT."""
+    """Scale to a width: lines and markers shrink, text has PAPER_PT, labels POINT_PT."""
     from matplotlib.lines import Line2D
     from matplotlib.text import Annotation, Text
 

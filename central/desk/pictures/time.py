@@ -34,10 +34,7 @@ LOGARITHMIC_FROM = 12.0
 def sum_in_bins(
     history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
-    """Sum each value over the BINS intervals of the run; empty intervals are omitted.
-
-    Returns interval middles [s] and sums.
-    """
+    """Sum each value over the filled ones of BINS intervals; return their middles [s] and sums."""
     edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
     at = np.searchsorted(edges, history.seconds(stamps_ns), "right")
     where = np.clip(at - 1, 0, BINS - 1)
@@ -47,9 +44,8 @@ def sum_in_bins(
 
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
-    """Draw NEES of poses and map, NIS and joint cost per degree of freedom over team time.
-
-    Empty panels are omitted; False if all are empty.
+    """Draw NEES, NIS and joint cost per degree of freedom over team time; False if all are
+    empty.
     """
     panels = [
         draw

@@ -82,10 +82,7 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
 
 
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
-    """Write report.html, report.json, pictures and trajectories; return the files.
-
-    figures: of the evaluation and the run.
-    """
+    """Write report.html, report.json, tables, pictures and trajectories; return the files."""
     directory.mkdir(parents=True, exist_ok=True)
     pictures = write_pictures(run, directory, PAGE)
     page, data = directory / "report.html", directory / "report.json"

@@ -16,11 +16,7 @@ from teamslam.central.desk.paths import SmoothedPath
 
 @dataclass(frozen=True)
 class Run:
-    """A run from its log.
-
-    ledger: None if not requested, or without inputs (`no_ledger`). taken_home: keyframe paths and
-    counts.
-    """
+    """A run from its log; ledger: None if not requested, or without inputs (`no_ledger`)."""
 
     evaluation: Evaluation
     history: History

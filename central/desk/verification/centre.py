@@ -102,10 +102,7 @@ def _extends(
 
 
 def recorded_map(log: Recorded, name: str) -> m.SavedMap:
-    """Make a saved map of a log's final map, solved again from its set.
-
-    Raises RerunError without a final map, NothingToSaveError.
-    """
+    """Make a saved map of a log's final map from its set. Raises RerunError, NothingToSaveError."""
     found = log.of(m.FusedMap, ch.FINAL_MAP) or log.of(m.FusedMap, ch.TEAM_FINAL)
     finals = [each for each in found if each.rule == "join"]
     if not finals:

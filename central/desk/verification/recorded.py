@@ -87,9 +87,8 @@ class RecordedOutput:
 class Recorded:
     """All node inputs and outputs in a log; each measurement once.
 
-    configured: last announcement of each node. outputs: recomputable messages by channel, in log
-    order. reported: consumed by the robot's report. published: announced by the source.
-    withdrawals: first order on each robot.
+    outputs: recomputable messages by channel. reported: consumed by the robot's report. published:
+    announced by the source. withdrawals: first order on each robot.
     """
 
     measurements: dict[Stream, RecordedMeasurements] = field(

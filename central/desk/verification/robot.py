@@ -121,10 +121,10 @@ def _withdrawn_at(log: Recorded, robot: str) -> WithdrawnAt:
 
 
 def _run_incarnations(log: Recorded, robot: str, new: NewRobot) -> Iterator[Outgoing]:
-    """Messages without feedback: each incarnation and each ended process is independent.
+    """Each incarnation and each ended process is independent; a `Done` names the process.
 
-    A `Done` names the process that it closes. A process that resumed after a submap is computed
-    from there, as is the rest after a missing measurement.
+    A process that resumed after a submap is computed from there, as is the rest after a missing
+    measurement.
     """
     for incarnation in log.incarnations(robot):
         measurements = log.measurements[(robot, incarnation)]
@@ -186,10 +186,7 @@ def _life(
 
 
 def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
-    """Run a robot's node over an incarnation's measurements; return how many it consumed.
-
-    The centre is absent, so the robot waits for no map. Raises RerunError.
-    """
+    """Run a robot's node, without a centre, over an incarnation; return how many it consumed."""
     node = RecomputedRobot(*log.robot_config(robot), {}, **options)
     node.take_known_map(log)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))

@@ -113,10 +113,7 @@ CHECKED = (
 
 @dataclass(frozen=True)
 class Difference:
-    """Recorded message that differs from the recomputed one.
-
-    names: of its inputs. lacks: an input is missing from the log.
-    """
+    """Recorded message that differs from the recomputed one; lacks: an input is not in the log."""
 
     key: str
     stamp_ns: int
@@ -136,9 +133,10 @@ class Difference:
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """Counts of one channel's messages: of all, bit-equal, and equal within tolerance.
+    """Counts of one channel's messages: all, bit-equal, equal within tolerance, without an
+    input.
 
-    first: first that differs, or else that lacks an input. lacking: messages that lack an input.
+    first: first that differs, or else that lacks an input.
     """
 
     channel: str

@@ -31,9 +31,7 @@ def landmarks_of(message: m.MapEstimate | m.FusedMap) -> Landmarks:
 
 
 def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
-    """Particle positions (ahead [m], left [m]) relative to their mean pose, for drawing at the
-    robot.
-    """
+    """Particle positions (ahead [m], left [m]) relative to their mean pose."""
     poses = floats(cloud.poses, "poses").astype(np.float64).reshape(-1, 3)
     weights = floats(cloud.weights, "weights").astype(np.float64)
     if not weights.sum() > 0.0:

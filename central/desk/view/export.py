@@ -79,10 +79,7 @@ class Drawn(NamedTuple):
 
 
 def export_views(log: Log, out: Path) -> Drawn:
-    """Write a log with its views, all redrawn, to a new log.
-
-    Raises LogError for a damaged log, RecorderError if `out` exists.
-    """
+    """Write a log with its views redrawn to a new log. Raises LogError, RecorderError."""
     written, drawn, before = 0, 0, 0
     with Recorder(out, log.team, log.metadata) as recorder:
 

@@ -1,7 +1,4 @@
-"""Foxglove WebSocket: views of a log or run, by the SDK of the extra `foxglove`.
-
-A new subscriber receives the newest view of its topic at once.
-"""
+"""Foxglove WebSocket: views of a log or run, by the SDK of the extra `foxglove`."""
 
 import logging
 import secrets

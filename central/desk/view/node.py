@@ -55,10 +55,9 @@ class Shown(NamedTuple):
 
 @dataclass
 class _Robot:
-    """State of one robot; its team pose is preferred to its own.
+    """One robot; its team pose is preferred to its own.
 
-    coming: estimates after the view's time. reached_ns: the robot's team time. at_ends: the
-    smoothed poses are those at the ends of submaps.
+    coming: estimates after the view's time. at_ends: the smoothed poses are at the ends of submaps.
     """
 
     coming: deque[m.PoseEstimate] = field(default_factory=deque)
@@ -92,7 +91,6 @@ class _Robot:
         self.errors.forget_poses()
 
     def go_to(self, now_ns: int, frames: TruthFrames) -> None:
-        """Apply estimates up to this time; frames: those with truth."""
         while self.coming and self.coming[0].stamp_ns <= now_ns:
             self.estimate = self.coming.popleft()
             x, y, _ = self.pose().tolist()
@@ -160,7 +158,6 @@ class ViewerNode:
         return out
 
     def _reached_ns(self) -> int | None:
-        """Team time up to which all robots have moved, or None."""
         marks = {n: r.reached_ns for n, r in self._robots.items() if r.reached_ns is not None}
         if not marks:
             return None

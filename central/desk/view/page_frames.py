@@ -68,8 +68,6 @@ def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
 
 @dataclass
 class _Stream:
-    """One robot's unsent poses."""
-
     errors: RunningErrors = field(default_factory=RunningErrors)
     by_team: bool = False
     outside: bool = False
@@ -249,7 +247,7 @@ class PageFrames:
     def _take_measurements(
         self, message: m.Observations | m.Points | m.Detections | m.Sightings
     ) -> None:
-        """Send measured places in the robot's frame, each landmark at most once in SEEN_NS."""
+        """Send places in the robot's frame, each landmark at most once in SEEN_NS."""
         stream, at = self._streams[message.robot], message.stamp_ns
         if isinstance(message, m.Points):
             places = floats(message.positions, "positions").reshape(-1, 2)

@@ -159,7 +159,6 @@ def _refuse(
 
 
 async def _proxy(host: str, port: int, behind: str) -> Server:
-    """Listen for viewers of the SDK's server at `behind`. Raises OSError."""
     return await serve(
         lambda viewer: _forward(viewer, behind), host, port,
         process_request=lambda viewer, request: _refuse(host, viewer, request, VIEWERS),
@@ -337,7 +336,6 @@ def free_port(host: str, port: int) -> int:
 
 
 def _reason(error: OSError) -> str:
-    """The system's text for an error; asyncio's repeats the address."""
     number = error.errno or 0
     return os.strerror(number) if number > 0 else error.strerror or str(error)
 
