@@ -117,7 +117,7 @@ def withdraw(
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> None:
-    """Order the team to continue without a lost robot; return on confirmation. Raises
+    """Order the team to go on without a lost robot; return on confirmation. Raises
     WithdrawError.
     """
     team = RunningTeam(bus, ch.STATUS)
@@ -174,8 +174,7 @@ def judge(
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:
-    """Publish a verdict on two unnamed landmarks, or its withdrawal; return the first map with
-    it.
+    """Publish a verdict on two unnamed landmarks, or its withdrawal; return the first map so.
 
     Raises NoRobotError, WithdrawError.
     """

@@ -90,9 +90,7 @@ def _between_ends(
 
 
 def _join_parts(parts: list[SmoothedPath]) -> SmoothedPath:
-    """A window's end, which the final map has, precedes a keyframe of the next window at that
-    stamp.
-    """
+    """Join by stamp; a window's end, which the final map has, precedes an equal keyframe."""
     arrays = zip(*((part.stamps_ns, part.poses, part.covariances) for part in parts), strict=True)
     stamps, poses, covariances = map(np.concatenate, arrays)
     stamps, first = np.unique(stamps, return_index=True)

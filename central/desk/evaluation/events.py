@@ -1,5 +1,6 @@
 """Detect a team's events."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,26 +10,13 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.channels import robot_node
 
 Kind = Literal[
-    "joined",
-    "restarted",
-    "lost",
-    "left",
-    "map",
-    "closure",
-    "undone",
-    "withdrawn",
-    "refused",
-    "warning",
-    "done",
-]
+    "joined", "restarted", "lost", "left", "map", "closure", "undone", "withdrawn", "refused",
+    "warning", "done",
+]  # fmt: skip
 MOST = 2000
 """Most events of a run."""
 FIRST = 1
-_AWAITED = (
-    "waiting for ",
-    "has not appeared yet",
-    "no measurements of this team yet",
-)
+_AWAITED = ("waiting for ", "has not appeared yet", "no measurements of this team yet")
 """Start-up states of a node, which are no events."""
 
 
@@ -45,6 +33,10 @@ class Event:
     def of(self) -> str:
         """Robot name, or the node's name."""
         return self.node.removeprefix("robot/")
+
+
+Found = Iterator[tuple[Kind, str, str]]
+"""Kind, node and text of each event."""
 
 
 @dataclass
@@ -66,125 +58,104 @@ class EventDetector:
 
     def take(self, message: m.Message, now_ns: int) -> list[Event]:
         """Detect the events of a message at team time `now_ns`."""
+        return [Event(now_ns, *found) for found in self._events(message)]
+
+    def _events(self, message: m.Message) -> Found:
         match message:
             case m.Liveliness():
-                return self._liveliness(message, now_ns)
+                yield from self._liveliness(message)
             case m.Configuration():
-                return self._configured(message, now_ns)
+                if self._alive.get(message.node) is False and message.node.startswith("robot/"):
+                    name = message.node.removeprefix("robot/")
+                    yield "restarted", message.node, f"{name} announces itself again"
             case m.InitialPose():
-                return self._incarnation(message, now_ns)
+                before = self._incarnations.get(message.robot, FIRST)
+                self._incarnations[message.robot] = max(before, message.incarnation)
+                if message.incarnation > before:
+                    text = (
+                        f"the stream of {message.robot} begins anew, incarnation "
+                        f"{message.incarnation}"
+                    )
+                    yield "restarted", robot_node(message.robot), text
             case m.Done() if robot_node(message.robot) not in self._done:
-                node = robot_node(message.robot)
-                self._done.add(node)
+                self._done.add(robot_node(message.robot))
                 text = (
                     f"{message.robot} has taken all its {message.measurements:,} measurements, "
                     f"{message.submaps} submaps"
                 )
-                return [Event(now_ns, "done", node, text)]
+                yield "done", robot_node(message.robot), text
             case m.End() if not self._ended:
                 self._ended = True
-                notes = [Event(now_ns, "warning", "world", note) for note in message.notes]
-                return [*notes, Event(now_ns, "done", "world", "the world has ended")]
+                for note in message.notes:
+                    yield "warning", "world", note
+                yield "done", "world", "the world has ended"
             case m.Withdrawal() if message.robot not in self._withdrawn:
                 self._withdrawn.add(message.robot)
                 by = "centre" if message.by == "central" else message.by
                 text = f"{message.robot} is withdrawn by the {by}: {message.reason}"
-                return [Event(now_ns, "withdrawn", robot_node(message.robot), text)]
+                yield "withdrawn", robot_node(message.robot), text
             case m.FusedMap():
-                return self._map(message, now_ns)
+                yield from self._map(message)
             case m.Status():
-                return self._status(message, now_ns)
+                yield from self._status(message)
             case _:
-                return []
+                pass
 
-    def _liveliness(self, message: m.Liveliness, now_ns: int) -> list[Event]:
+    def _liveliness(self, message: m.Liveliness) -> Found:
         node, name = message.node, message.node.removeprefix("robot/")
         before = self._alive.get(node)
         self._alive[node] = message.alive
         if before is message.alive:
-            return []
-        if message.alive:
-            if before is None:
-                return [Event(now_ns, "joined", node, f"{name} joined")]
-            return [Event(now_ns, "restarted", node, f"{name} came back")]
-        if node in self._done or self._ended:
-            return [Event(now_ns, "left", node, f"{name} left")]
-        return [Event(now_ns, "lost", node, f"{name} was lost")]
+            return
+        if message.alive and before is None:
+            yield "joined", node, f"{name} joined"
+        elif message.alive:
+            yield "restarted", node, f"{name} came back"
+        elif node in self._done or self._ended:
+            yield "left", node, f"{name} left"
+        else:
+            yield "lost", node, f"{name} was lost"
 
-    def _configured(self, message: m.Configuration, now_ns: int) -> list[Event]:
-        if self._alive.get(message.node) is not False or not message.node.startswith("robot/"):
-            return []
-        name = message.node.removeprefix("robot/")
-        return [Event(now_ns, "restarted", message.node, f"{name} announces itself again")]
-
-    def _incarnation(self, start: m.InitialPose, now_ns: int) -> list[Event]:
-        before = self._incarnations.get(start.robot, FIRST)
-        self._incarnations[start.robot] = max(before, start.incarnation)
-        if start.incarnation <= before:
-            return []
-        text = f"the stream of {start.robot} begins anew, incarnation {start.incarnation}"
-        return [Event(now_ns, "restarted", robot_node(start.robot), text)]
-
-    def _map(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
+    def _map(self, fused: m.FusedMap) -> Found:
         apart = {
             name: f"{who} not joined: {why}"
             for who, why in not_joined(fused.reasons)
             for name in who.split(", ")
         }
         members = {member.robot for member in fused.members} - apart.keys()
-        events = [
-            Event(now_ns, "map", robot_node(robot), f"{robot} is in the team's map")
-            for robot in in_order(members - self._members)
-        ]
-        events += [
-            Event(now_ns, "withdrawn", robot_node(robot), f"{robot} was withdrawn from the map")
-            for robot in in_order((self._members & {*fused.withdrawn}) - self._withdrawn)
-        ]
+        for robot in in_order(members - self._members):
+            yield "map", robot_node(robot), f"{robot} is in the team's map"
+        for robot in in_order((self._members & {*fused.withdrawn}) - self._withdrawn):
+            yield "withdrawn", robot_node(robot), f"{robot} was withdrawn from the map"
         self._members = members
-        events += self._decisions(fused, now_ns)
-        events += [
-            Event(now_ns, "map", "central", short(words))
-            for words in fused.joined
-            if words not in self._joined
-        ]
+        for each in fused.decisions:
+            name = (each.stamp_ns, each.kind, each.about)
+            if each.kind != "waits" and name not in self._decided:
+                self._decided.add(name)
+                kind: Kind = "undone" if each.kind == "undone" else "closure"
+                yield kind, "central", _describe_decision(each)
+        for words in fused.joined:
+            if words not in self._joined:
+                yield "map", "central", short(words)
         self._joined |= {*fused.joined}
-        new = dict.fromkeys(apart[name] for name in in_order(apart.keys() - self._apart))
-        events += [Event(now_ns, "warning", "central", words) for words in new]
+        for words in dict.fromkeys(apart[name] for name in in_order(apart.keys() - self._apart)):
+            yield "warning", "central", words
         self._apart = {*apart}
         said = (*map(describe, fused.diagnosis), *fused.reasons)
         reasons = {without_decimals(each): each for each in said if not _is_apart(each)}
-        events += [
-            Event(now_ns, "warning", "central", reasons[shape])
-            for shape in sorted(reasons.keys() - self._reasons.keys())
-        ]
-        events += [
-            Event(now_ns, "map", "central", f"no longer: {self._reasons[shape]}")
-            for shape in sorted(self._reasons.keys() - reasons.keys())
-        ]
+        for shape in sorted(reasons.keys() - self._reasons.keys()):
+            yield "warning", "central", reasons[shape]
+        for shape in sorted(self._reasons.keys() - reasons.keys()):
+            yield "map", "central", f"no longer: {self._reasons[shape]}"
         self._reasons = reasons
         if fused.final:
-            count = len(fused.ids) // 4
-            events.append(Event(now_ns, "done", "central", f"final map of {count} landmarks"))
             self._done |= set(self._alive)
-        return events
+            yield "done", "central", f"final map of {len(fused.ids) // 4} landmarks"
 
-    def _decisions(self, fused: m.FusedMap, now_ns: int) -> list[Event]:
-        events = []
-        for each in fused.decisions:
-            name = (each.stamp_ns, each.kind, each.about)
-            if each.kind == "waits" or name in self._decided:
-                continue
-            self._decided.add(name)
-            kind: Kind = "undone" if each.kind == "undone" else "closure"
-            events.append(Event(now_ns, kind, "central", decision_words(each)))
-        return events
-
-    def _status(self, status: m.Status, now_ns: int) -> list[Event]:
-        events = []
+    def _status(self, status: m.Status) -> Found:
         refused = int(status.figures.get("refused", 0.0))
         if refused > self._refused and status.node == "central":
-            text = f"the centre refused {refused - self._refused} submaps"
-            events.append(Event(now_ns, "refused", "central", text))
+            yield "refused", "central", f"the centre refused {refused - self._refused} submaps"
             self._refused = refused
         for warning in status.warnings:
             gist = (status.node, without_decimals(warning))
@@ -192,12 +163,10 @@ class EventDetector:
                 continue
             self._warned.add(gist)
             kind: Kind = "refused" if "refused" in warning else "warning"
-            events.append(Event(now_ns, kind, status.node, f"{status.node}: {warning}"))
-        return events
+            yield kind, status.node, f"{status.node}: {warning}"
 
 
-def decision_words(decision: m.AssociationDecision) -> str:
-    """Describe a closure or merge with its figures."""
+def _describe_decision(decision: m.AssociationDecision) -> str:
     figures = (
         f"{decision.pairs} landmarks, log-likelihood ratio {decision.llr:.0f} against "
         f"{decision.rival_llr:.0f}, share {decision.share:.2f}, {decision.absent} absent"

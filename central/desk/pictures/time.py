@@ -44,9 +44,7 @@ def sum_in_bins(
 
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
-    """Draw NEES, NIS and joint cost per degree of freedom over team time; False if all are
-    empty.
-    """
+    """Draw NEES, NIS and joint cost per dof over team time; False if all are empty."""
     panels = [
         draw
         for draw, is_there in (
