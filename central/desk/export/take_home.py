@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path as FilePath
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import msgspec
@@ -38,7 +37,6 @@ STATE = "state"
 """Further column of a map that was compared with saved ones: moved, gone, new, unchanged."""
 CLASSES = ("class", "class_probability")
 """Further columns of a map whose landmarks have classes."""
-NO_CLASSES: Mapping[int, tuple[str, float]] = MappingProxyType({})
 Member: TypeAlias = tuple[str, int, int, int]
 """(robot, incarnation, sequence, number) of a submap's landmark."""
 PATH_COLUMNS = (
@@ -54,8 +52,8 @@ class TakenHome:
     measurements: count by landmark. classes: name and probability of a landmark's likeliest class.
     """
 
-    paths: Mapping[str, SmoothedPath]
-    measurements: Mapping[int, int]
+    paths: Mapping[str, SmoothedPath] = field(default_factory=dict)
+    measurements: Mapping[int, int] = field(default_factory=dict)
     datum: Datum | None = None
     classes: Mapping[int, tuple[str, float]] = field(default_factory=dict)
 
@@ -129,37 +127,32 @@ def _detections(submap: m.Submap) -> Iterator[tuple[Member, int]]:
         yield (submap.robot, submap.incarnation, submap.sequence, local), count
 
 
-def write_map(
-    fused: MapResult,
-    measurements: Mapping[int, int],
-    folder: FilePath,
-    datum: Datum | None = None,
-    classes: Mapping[int, tuple[str, float]] = NO_CLASSES,
-) -> list[FilePath]:
+def write_map(fused: MapResult, taken: TakenHome, folder: FilePath) -> list[FilePath]:
     """Write map.csv and map.json with 2 × 2 covariances; return the files."""
+    datum, states = taken.datum, {each.landmark: each.state for each in fused.changes}
     rows: list[dict[str, Any]] = []
-    blocks = landmark_blocks(fused.covariance)
-    for landmark, (x, y), block in zip(
-        fused.ids.tolist(), fused.means.tolist(), blocks.tolist(), strict=True
-    ):
-        (xx, xy), (_, yy) = block
-        count = measurements.get(landmark, None if landmark >= UNNAMED else 0)
+    for landmark, (x, y), ((xx, xy), (_, yy)) in zip(
+        fused.ids.tolist(), fused.means.tolist(), landmark_blocks(fused.covariance).tolist(),
+        strict=True,
+    ):  # fmt: skip
+        count = taken.measurements.get(landmark, None if landmark >= UNNAMED else 0)
         values = (landmark, x, y, xx, xy, yy, count, fused.frame)
-        rows.append(dict(zip(MAP_COLUMNS, values, strict=True)))
-    columns: tuple[str, ...] = MAP_COLUMNS
-    if fused.changes:
-        columns += (STATE,)
-        states = {each.landmark: each.state for each in fused.changes}
-        for row in rows:
-            row[STATE] = states.get(row["id"])
-    if classes:
-        columns += CLASSES
-        for row in rows:
-            row.update(zip(CLASSES, classes.get(row["id"], (None, None)), strict=True))
+        row = dict(zip(MAP_COLUMNS, values, strict=True))
+        if states:
+            row[STATE] = states.get(landmark)
+        if taken.classes:
+            found = taken.classes.get(landmark, (None, None))
+            row |= zip(CLASSES, found, strict=True)
+        rows.append(row)
     if datum is not None:
-        columns += DEGREES
         for row, place in zip(rows, geodetic_from_local(datum, fused.means).tolist(), strict=True):
-            row.update(zip(DEGREES, place, strict=True))
+            row |= zip(DEGREES, place, strict=True)
+    columns = (
+        *MAP_COLUMNS,
+        *[STATE] * bool(states),
+        *CLASSES * bool(taken.classes),
+        *DEGREES * (datum is not None),
+    )
     table, data = folder / "map.csv", folder / "map.json"
     with table.open("w", encoding="utf-8", newline="") as lines:
         writer = csv.DictWriter(lines, columns, lineterminator="\n")

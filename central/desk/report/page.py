@@ -90,11 +90,8 @@ def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[
     page.write_text(_page(run, pictures, figures.get("processes", {})), encoding="utf-8")
     written = [page, data]
     if run.evaluation.map is not None:
-        counts = {} if run.taken_home is None else run.taken_home.measurements
-        datum = None if run.taken_home is None else run.taken_home.datum
-        classes = {} if run.taken_home is None else run.taken_home.classes
-        written += write_map(run.evaluation.map, counts, directory, datum, classes)
-        if datum is not None:
+        written += write_map(run.evaluation.map, run.taken_home, directory)
+        if (datum := run.taken_home.datum) is not None:
             written.append(write_geojson(run.evaluation.map, run.paths, directory, datum))
     if run.paths:
         write_paths(run.paths, directory / "paths")

@@ -1,7 +1,7 @@
 """Contents of a run's report, and its figures for JSON."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,13 +23,13 @@ class Run:
     provenance: Mapping[str, str]
     ledger: Ledger | None = None
     no_ledger: str = "not asked for; `teamslam verify-ledger LOG` proves it"
-    taken_home: TakenHome | None = None
+    taken_home: TakenHome = field(default_factory=TakenHome)
     command: str = ""
 
     @property
     def paths(self) -> Mapping[str, SmoothedPath]:
         """Smoothed paths by robot, if requested."""
-        return {} if self.taken_home is None else self.taken_home.paths
+        return self.taken_home.paths
 
     def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
         """Errors by robot and kind of path ("smoothed", "online")."""

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import msgspec
 import numpy as np
 
 from teamslam.central.desk.drawing import colour_of
-from teamslam.central.desk.evaluation.errors import PoseErrors, transform_points
+from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.events import Event, EventDetector
 from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment, TruthFrames
 from teamslam.central.desk.names import in_order
@@ -43,6 +44,7 @@ FORGET_NS = 10_000_000_000
 """Time for which an estimate waits for its truth."""
 _MARKS_ACROSS = 45.0
 """Drawn robots that fit across the known extent."""
+Motion = Float[np.ndarray, "3"] | None
 
 
 class Shown(NamedTuple):
@@ -97,15 +99,12 @@ class _Robot:
             self.track.take(self.estimate.stamp_ns, x, y)
             if frames.has(self.estimate.frame):
                 self.errors.take_pose(self.estimate)
-        self.note(self.errors.known())
+        if (known := self.errors.known()) is not None:
+            self.last_error = known.errors[-1], float(known.nees[-1]) / 3.0
         true = self.errors.truth_at(now_ns)
         if true is not None:
             self.true_track.take(now_ns, float(true[0]), float(true[1]))
         self.errors.forget(now_ns - FORGET_NS)
-
-    def note(self, errors: PoseErrors | None) -> None:
-        if errors is not None:
-            self.last_error = (errors.errors[-1], float(errors.nees[-1]) / 3.0)
 
 
 class ViewerNode:
@@ -246,24 +245,32 @@ class ViewerNode:
 
     def _views(self, now_ns: int, *, last: bool = False) -> list[Shown]:
         self._go_to(now_ns, last=last)
-        size = self._size_m()
-        seen = {n: r for n, r in self._in_order() if r.estimate is not None}
-        out = self._of_map(now_ns, size) if self._map_is_new else []
-        self._map_is_new = False
-        out.append(Shown(views.ROBOTS.key(), now_ns, self._scene(now_ns, size)))
-        poses = [(name, robot.pose()) for name, robot in seen.items()]
-        out.append(Shown(views.TRANSFORMS.key(), now_ns, fox.transforms(now_ns, poses)))
-        for name, robot in seen.items():
-            pose = fox.pose_in_map(now_ns, robot.pose())
-            out.append(Shown(views.POSE.key(name), now_ns, pose))
-            figures = msgspec.json.encode(_figures(robot, now_ns))
-            out.append(Shown(views.ROBOT.key(name), now_ns, figures))
-        out += self._clouds(now_ns)
-        out.append(Shown(views.TEAM.key(), now_ns, msgspec.json.encode(self._team(now_ns))))
-        if last or self._turn % PATHS_EVERY == 0:
-            out.append(Shown(views.PATHS.key(), now_ns, self._paths(now_ns)))
+        found = [Shown(key, now_ns, payload) for key, payload in self._payloads(now_ns, last=last)]
         self._turn += 1
-        return out
+        return found
+
+    def _payloads(self, now_ns: int, *, last: bool) -> Iterator[tuple[str, bytes]]:
+        size = self._size_m()
+        motion = self._truth.map_from_truth(self._fused)
+        seen = {n: r for n, r in self._in_order() if r.estimate is not None}
+        if self._map_is_new:
+            self._map_is_new = False
+            yield from self._map_payloads(now_ns, size, motion)
+        yield views.ROBOTS.key(), self._scene(now_ns, size, motion)
+        poses = [(name, robot.pose()) for name, robot in seen.items()]
+        yield views.TRANSFORMS.key(), fox.transforms(now_ns, poses)
+        for name, robot in seen.items():
+            yield views.POSE.key(name), fox.pose_in_map(now_ns, robot.pose())
+            yield views.ROBOT.key(name), msgspec.json.encode(_figures(robot, now_ns))
+        for name, robot in seen.items():
+            if robot.cloud is not None:
+                points = place_points(centre_particles(robot.cloud), robot.pose().tolist())
+                weights = floats(robot.cloud.weights, "weights").astype(np.float64)
+                yield views.PARTICLES.key(name), fox.cloud(now_ns, points, weights, "weight")
+                robot.cloud = None
+        yield views.TEAM.key(), msgspec.json.encode(self._team(now_ns))
+        if last or self._turn % PATHS_EVERY == 0:
+            yield views.PATHS.key(), self._paths(now_ns, size, motion)
 
     def _go_to(self, now_ns: int, *, last: bool) -> None:
         """Advance all parts to this time; the last view has the final map."""
@@ -278,10 +285,10 @@ class ViewerNode:
             if robot.estimate is not None:
                 self._extend(robot.pose()[np.newaxis, :2])
 
-    def _of_map(self, now_ns: int, size_m: float) -> list[Shown]:
-        out = []
+    def _map_payloads(
+        self, now_ns: int, size_m: float, motion: Motion
+    ) -> Iterator[tuple[str, bytes]]:
         entities = []
-        motion = self._truth.map_from_truth(self._fused)
         if len(self._truth.landmarks.ids) and motion is not None:
             true = transform_points(motion, self._truth.landmarks.positions)
             entities.append(fox.true_landmarks_entity(now_ns, true, size_m))
@@ -289,12 +296,11 @@ class ViewerNode:
             entities.append(fox.landmarks_entity(now_ns, self._landmarks, size_m))
             names = self._landmarks.ids.astype(np.float64)
             points = fox.cloud(now_ns, self._landmarks.means, names, "id")
-            out.append(Shown(views.LANDMARKS.key(), now_ns, points))
-        return [*out, Shown(views.MAP.key(), now_ns, fox.scene(entities))]
+            yield views.LANDMARKS.key(), points
+        yield views.MAP.key(), fox.scene(entities)
 
-    def _scene(self, now_ns: int, size_m: float) -> bytes:
+    def _scene(self, now_ns: int, size_m: float, motion: Motion) -> bytes:
         entities = []
-        motion = self._truth.map_from_truth(self._fused)
         for number, (name, robot) in enumerate(self._in_order()):
             true = robot.errors.truth_at(now_ns)
             if true is not None and motion is not None:
@@ -310,36 +316,27 @@ class ViewerNode:
                 )  # fmt: skip
         return fox.scene(entities)
 
-    def _paths(self, now_ns: int) -> bytes:
+    def _paths(self, now_ns: int, size_m: float, motion: Motion) -> bytes:
         entities = []
-        motion = self._truth.map_from_truth(self._fused)
         for number, (name, robot) in enumerate(self._in_order()):
             colour = colour_of(number)
             true = np.array(robot.true_track.points).reshape(-1, 2)
             true = true[:0] if motion is None else transform_points(motion, true)
-            for what, points, shade, pixels in (
+            lines = [
                 ("true path", [(x, y) for x, y in true.tolist()], (fox.TRUTH[0], 0.5), 1.0),
                 ("path", robot.track.points, (colour, 0.5), 1.5),
-                ("smoothed path", robot.smoothed, (colour, 1.0), 2.5),
-            ):
-                if what == "smoothed path" and robot.at_ends:
-                    named = f"smoothed poses {name}"
-                    entities.append(fox.dots_entity(now_ns, named, points, shade, self._size_m()))
-                elif len(points) > 1:
-                    named = f"{what} {name}"
-                    entities.append(fox.path_entity(now_ns, named, points, shade, pixels))
+            ]
+            if not robot.at_ends:
+                lines.append(("smoothed path", robot.smoothed, (colour, 1.0), 2.5))
+            entities += [
+                fox.path_entity(now_ns, f"{what} {name}", points, shade, pixels)
+                for what, points, shade, pixels in lines
+                if len(points) > 1
+            ]
+            if robot.at_ends:
+                dots = robot.smoothed, (colour, 1.0), size_m
+                entities.append(fox.dots_entity(now_ns, f"smoothed poses {name}", *dots))
         return fox.scene(entities)
-
-    def _clouds(self, now_ns: int) -> list[Shown]:
-        out = []
-        for name, robot in self._in_order():
-            if robot.cloud is not None and robot.estimate is not None:
-                points = place_points(centre_particles(robot.cloud), robot.pose().tolist())
-                weights = floats(robot.cloud.weights, "weights").astype(np.float64)
-                payload = fox.cloud(now_ns, points, weights, "weight")
-                out.append(Shown(views.PARTICLES.key(name), now_ns, payload))
-                robot.cloud = None
-        return out
 
     def _team(self, now_ns: int) -> views.TeamFigures:
         fused = self._fused
@@ -369,11 +366,7 @@ def _figures(robot: _Robot, now_ns: int) -> views.RobotFigures:
     )
     if robot.last_error is None:
         return figures
-    (ex, ey, turned), nees = robot.last_error
-    return msgspec.structs.replace(
-        figures,
-        error_x_m=float(ex),
-        error_y_m=float(ey),
-        error_heading_rad=float(turned),
-        nees_per_dof=nees,
-    )
+    errors, nees = robot.last_error
+    names = "error_x_m", "error_y_m", "error_heading_rad"
+    named = dict(zip(names, errors.tolist(), strict=True))
+    return msgspec.structs.replace(figures, **named, nees_per_dof=nees)

@@ -11,6 +11,7 @@ from teamslam.central.desk.evaluation.errors import pose_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.export.take_home import (
     MAP_COLUMNS,
+    TakenHome,
     take_home,
     write_geojson,
     write_map,
@@ -97,7 +98,7 @@ def test_between_the_ends_the_covariance_is_that_of_the_errors(log):
 def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
     home = take_home(recorded_of(log))
     fused = evaluate(log).map
-    write_map(fused, home.measurements, tmp_path)
+    write_map(fused, home, tmp_path)
     with (tmp_path / "map.csv").open() as lines:
         rows = list(csv.DictReader(lines))
     assert tuple(rows[0]) == MAP_COLUMNS
@@ -125,7 +126,7 @@ def test_a_map_beside_a_saved_one_has_each_landmarks_state(log, tmp_path):
         m.LandmarkChange(landmark=first, state="gone"),
         m.LandmarkChange(landmark=second, state="moved", dx=1.0),
     )
-    write_map(replace(fused, changes=changes), {}, tmp_path)
+    write_map(replace(fused, changes=changes), TakenHome(), tmp_path)
     with (tmp_path / "map.csv").open() as lines:
         rows = list(csv.DictReader(lines))
     assert [row["state"] for row in rows[:3]] == ["gone", "moved", ""]
@@ -138,7 +139,7 @@ def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_pat
     assert home.datum is None  # the frame of the start poses
     fused = evaluate(log).map
     classes = {int(fused.ids[0]): ("tree", 0.75)}
-    write_map(fused, home.measurements, tmp_path, DATUM, classes)
+    write_map(fused, replace(home, datum=DATUM, classes=classes), tmp_path)
     with (tmp_path / "map.csv").open() as lines:
         rows = list(csv.DictReader(lines))
     assert (rows[0]["class"], rows[0]["class_probability"]) == ("tree", "0.75")
