@@ -1,6 +1,6 @@
 """Compare runs: tables and pictures."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +12,14 @@ from teamslam.central.desk.drawing import (
     TRUTH_COLOUR,
     VERMILION,
     draw_ellipses,
-    landmark_blocks,
     robot_colours,
 )
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult, figure
 from teamslam.central.desk.names import OUTSIDE, in_order
 from teamslam.central.desk.pictures.run import in_the_maps_frame, new_figure, set_up_map
 from teamslam.central.desk.pictures.style import save
-from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable, format_figure
+from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable
+from teamslam.team import translate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,45 +28,62 @@ Row = tuple[str, tuple[str, ...]]
 MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
 
 
+def _in_the_frame(path: str) -> Callable[[Evaluation], Any]:
+    """Figure of a run that an arbitrary frame makes meaningless."""
+    return lambda run: None if run.arbitrary_frame else figure(run, path)
+
+
+_TEAM = (
+    Column("scenario", lambda run: run.scenario and run.title),
+    Column(
+        "method", lambda run: run.scenario and f"{run.scenario.estimator} + {run.scenario.fusion}"
+    ),
+    Column("landmarks", lambda run: run.map and len(run.map.ids)),
+    Column("landmark RMSE [m]", _in_the_frame("map.errors.rmse_m"), ".4f"),
+    Column("… after rigid alignment [m]", "map.errors.aligned_rmse_m", ".4f"),
+    Column("map NEES per dof", _in_the_frame("map.errors.nees_per_dof"), ".4g"),
+    Column("joint cost per dof", "map.cost_per_dof", ".4g"),
+    Column("covariance scale", "map.covariance_scale", ".2f"),
+    Column("maps broadcast", lambda run: figure(run.channels.get("central/map"), "messages") or 0),
+    Column("rule of the final map", "map.rule"),
+    Column("final map, its bytes", lambda run: run.map and run.map.payload_sha256[:16]),
+)
+_ROBOT = (
+    Column(
+        "online position RMSE [m]",
+        lambda robot: (
+            OUTSIDE if figure(robot, "outside") else figure(robot, "online.position_rmse_m")
+        ),
+        ".4f",
+    ),
+    Column("… aligned [m]", "online_aligned_rmse_m", ".4f"),
+    Column("smoothed position RMSE [m]", "smoothed.position_rmse_m", ".4f"),
+    Column("… aligned, smoothed [m]", "aligned_rmse_m", ".4f"),
+    Column("heading RMSE, smoothed [°]", "smoothed.heading_rmse_rad", ".3f", DEGREES),
+    Column("pose NEES per dof", "smoothed.nees_per_dof", ".3g"),
+    Column("uplink [bytes/step]", "uplink_bytes_per_step", ".1f"),
+)
+
+
 def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
     """Rows (figure, one cell per run)."""
     every = list(runs.values())
-    columns = [_team_cells(run) for run in every]
-    rows = [(name, tuple(of[name] for of in columns)) for name in (columns[0] if columns else ())]
+    rows = _rows("", _TEAM, every)
     matched = tuple(run.matched_by for run in every)
     rows += [("landmark errors by", matched)] if any(matched) else []
     for robot in in_order({name for run in every for name in run.states}):
-        states = tuple(format_figure(figure(run.states.get(robot), "state"), "") for run in every)
+        states = tuple(figure(run.states.get(robot), "state") or "–" for run in every)
         rows.append((f"{robot}: in the final map", states))
-    for robot in in_order({name for run in every for name in run.robots}):
-        of_runs = zip(*(_robot_cells(run, run.robots.get(robot)) for run in every), strict=True)
-        names = (f"{robot}: {column.heading}" for column in _ROBOT)
-        rows += zip(names, of_runs, strict=True)
+    for name in in_order({name for run in every for name in run.robots}):
+        robots = ((run, run.robots.get(name)) for run in every)
+        rows += _rows(f"{name}: ", _ROBOT, [of and comparable(run, of) for run, of in robots])
     return rows
 
 
-def _team_cells(run: Evaluation) -> dict[str, str]:
-    fused, scenario = run.map, run.scenario
-    shown = {c.heading: cells(run, [c])[0] for c in _MAP}
-    if run.arbitrary_frame:
-        shown |= {c.heading: "–" for c in _MAP if c.of in _IN_THE_FRAME}
-    broadcast = run.channels.get("central/map")
-    return {
-        "scenario": "–" if scenario is None else run.title,
-        "method": "–" if scenario is None else f"{scenario.estimator} + {scenario.fusion}",
-        "landmarks": "–" if fused is None else str(len(fused.ids)),
-        **shown,
-        "maps broadcast": str(0 if broadcast is None else broadcast.messages),
-        "rule of the final map": "–" if fused is None else fused.rule,
-        "final map, its bytes": "–" if fused is None else fused.payload_sha256[:16],
-    }
-
-
-def _robot_cells(run: Evaluation, robot: RobotResult | None) -> list[str]:
-    if robot is None:
-        return ["–"] * len(_ROBOT)
-    online, *rest = cells(comparable(run, robot), _ROBOT)
-    return [OUTSIDE if robot.outside else online, *rest]
+def _rows(before: str, columns: Sequence[Column], of: Sequence[object]) -> list[Row]:
+    by_column = zip(*(cells(each, columns) for each in of), strict=True)
+    names = (f"{before}{column.heading}" for column in columns)
+    return list(zip(names, by_column, strict=True)) if of else []
 
 
 def compare_figures(runs: Mapping[str, Evaluation]) -> dict[str, Any]:
@@ -156,24 +173,4 @@ def _draw_map(axis: "Axes", fused: MapResult, colour: str, label: str, marker: s
     axis.plot(
         *fused.means.T, marker, color=colour, markersize=8, markerfacecolor="none", label=label
     )
-    draw_ellipses(axis, fused.means, landmark_blocks(fused.covariance), colour)
-
-
-_MAP = (
-    Column("landmark RMSE [m]", "map.errors.rmse_m", ".4f"),
-    Column("… after rigid alignment [m]", "map.errors.aligned_rmse_m", ".4f"),
-    Column("map NEES per dof", "map.errors.nees_per_dof", ".4g"),
-    Column("joint cost per dof", "map.cost_per_dof", ".4g"),
-    Column("covariance scale", "map.covariance_scale", ".2f"),
-)
-_IN_THE_FRAME = ("map.errors.rmse_m", "map.errors.nees_per_dof")
-"""Figures that an arbitrary frame makes meaningless."""
-_ROBOT = (
-    Column("online position RMSE [m]", "online.position_rmse_m", ".4f"),
-    Column("… aligned [m]", "online_aligned_rmse_m", ".4f"),
-    Column("smoothed position RMSE [m]", "smoothed.position_rmse_m", ".4f"),
-    Column("… aligned, smoothed [m]", "aligned_rmse_m", ".4f"),
-    Column("heading RMSE, smoothed [°]", "smoothed.heading_rmse_rad", ".3f", DEGREES),
-    Column("pose NEES per dof", "smoothed.nees_per_dof", ".3g"),
-    Column("uplink [bytes/step]", "uplink_bytes_per_step", ".1f"),
-)
+    draw_ellipses(axis, fused.means, translate.blocks_of(fused.covariance), colour)

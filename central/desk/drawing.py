@@ -108,11 +108,3 @@ def draw_ellipses(
                 fill=False, edgecolor=colour, linewidth=width, zorder=zorder,
             )
         )  # fmt: skip
-
-
-def landmark_blocks(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "L 2 2"]:
-    """2 × 2 covariance of each landmark from the joint one."""
-    at = np.arange(0, len(covariance), 2)
-    rows = at[:, np.newaxis] + np.arange(2)
-    blocks: Float[np.ndarray, "L 2 2"] = covariance[rows[:, :, np.newaxis], rows[:, np.newaxis, :]]
-    return blocks

@@ -17,18 +17,8 @@ from teamslam.central.desk.verification.recorded import RerunError, index_log
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.ros2 import encoding as ros
 from teamslam.team.ros2.bags import new_bag
-from teamslam.team.ros2.encoding import (
-    Names,
-    Pose,
-    compose,
-    encode,
-    odometry,
-    pose_stamped,
-    pose_with_covariance,
-    transform,
-    transforms,
-)
 from teamslam.team.ros2_answers import Answer, Answers
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -46,9 +36,9 @@ class _Robot:
     def __init__(self, name: str) -> None:
         self.config: RobotConfig | None = None
         frames = {"odometry_frame": f"{name}/odom", "base_frame": f"{name}/base_link"}
-        self.names = Names(f"/{name}", **frames)
+        self.names = ros.Names(f"/{name}", **frames)
         self.answers = Answers(self.names)
-        self.pose: Pose = (0.0, 0.0, 0.0)
+        self.pose: ros.Pose = (0.0, 0.0, 0.0)
         self.incarnation = 0
         self._written_ns = -(2**62)
 
@@ -59,23 +49,23 @@ class _Robot:
             self.incarnation, self.pose = message.incarnation, (0.0, 0.0, 0.0)
         interval = translate.interval_of(message, self.config)
         step = interval.part(self.config.motion, interval.duration_ns, 0).mean.tolist()
-        self.pose = compose(self.pose, (step[0], step[1], step[2]))
+        self.pose = ros.compose(self.pose, (step[0], step[1], step[2]))
         stamp_ns, names = interval.end_ns, self.names
         self.answers.add_odometry(stamp_ns, self.pose)
         if stamp_ns - self._written_ns < 1e9 / ODOMETRY_HZ:
             return
         self._written_ns = stamp_ns
         speeds = interval.forward, interval.yaw_rate
-        one = transform(stamp_ns, names.odometry_frame, names.base_frame, self.pose)
-        yield Answer(names.tf, "tf2_msgs/msg/TFMessage", stamp_ns, encode(transforms(one)))
-        data = encode(odometry(stamp_ns, names, self.pose, speeds))
+        one = ros.transform(stamp_ns, names.odometry_frame, names.base_frame, self.pose)
+        yield Answer(names.tf, "tf2_msgs/msg/TFMessage", stamp_ns, ros.encode(ros.transforms(one)))
+        data = ros.encode(ros.odometry(stamp_ns, names, self.pose, speeds))
         yield Answer(names.topic("odometry"), "nav_msgs/msg/Odometry", stamp_ns, data)
 
 
 def answers_of(log: Log) -> Iterator[Answer]:
     """Convert a log to ROS 2 messages; at last the smoothed and the true poses."""
     robots: dict[str, _Robot] = {}
-    team = Answers(Names(TEAM_SPACE))
+    team = Answers(ros.Names(TEAM_SPACE))
     final = False
     for sample in log.samples():
         if (sound := try_open(sample)) is None:
@@ -101,13 +91,13 @@ def answers_of(log: Log) -> Iterator[Answer]:
 
 def _smoothed(log: Log) -> Iterator[Answer]:
     for robot, path in smoothed_paths(index_log(log)).items():
-        names = Names(f"/{robot}")
+        names = ros.Names(f"/{robot}")
         for stamp_ns, (x, y, theta), P in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), path.covariances, strict=True
         ):
-            pose = pose_with_covariance(stamp_ns, names.map_frame, (x, y, theta), P)
+            pose = ros.pose_with_covariance(stamp_ns, names.map_frame, (x, y, theta), P)
             kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
-            yield Answer(names.topic("smoothed_pose"), kind, stamp_ns, encode(pose))
+            yield Answer(names.topic("smoothed_pose"), kind, stamp_ns, ros.encode(pose))
 
 
 def _true(log: Log) -> Iterator[Answer]:
@@ -119,16 +109,16 @@ def _true(log: Log) -> Iterator[Answer]:
         for stamp_ns, (x, y, theta) in zip(
             result.truth.stamps_ns.tolist(), result.truth.poses.tolist(), strict=True
         ):
-            data = encode(pose_stamped(stamp_ns, TRUTH_FRAME, (x, y, theta)))
+            data = ros.encode(ros.pose_stamped(stamp_ns, TRUTH_FRAME, (x, y, theta)))
             yield Answer(topic, "geometry_msgs/msg/PoseStamped", stamp_ns, data)
         starts_ns += result.truth.stamps_ns[:1].tolist()
     motion = evaluation.truth_from_map if evaluation.arbitrary_frame else np.zeros(3)
     if starts_ns and motion is not None:
         x, y, theta = motion.tolist()
         stamp_ns = min(starts_ns)
-        one = transform(stamp_ns, TRUTH_FRAME, Names(TEAM_SPACE).map_frame, (x, y, theta))
+        one = ros.transform(stamp_ns, TRUTH_FRAME, ros.Names(TEAM_SPACE).map_frame, (x, y, theta))
         kind = "tf2_msgs/msg/TFMessage"
-        yield Answer("/tf_static", kind, stamp_ns, encode(transforms(one)), latched=True)
+        yield Answer("/tf_static", kind, stamp_ns, ros.encode(ros.transforms(one)), latched=True)
 
 
 def export_rosbag2(log: Log, folder: Path) -> dict[str, int]:

@@ -12,7 +12,6 @@ from typing import Any, TypeAlias
 import msgspec
 import numpy as np
 
-from teamslam.central.desk.drawing import landmark_blocks
 from teamslam.central.desk.evaluation.errors import Path
 from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.central.desk.export.tum import seconds, write_tum
@@ -132,7 +131,7 @@ def write_map(fused: MapResult, taken: TakenHome, folder: FilePath) -> list[File
     datum, states = taken.datum, {each.landmark: each.state for each in fused.changes}
     rows: list[dict[str, Any]] = []
     for landmark, (x, y), ((xx, xy), (_, yy)) in zip(
-        fused.ids.tolist(), fused.means.tolist(), landmark_blocks(fused.covariance).tolist(),
+        fused.ids.tolist(), fused.means.tolist(), translate.blocks_of(fused.covariance).tolist(),
         strict=True,
     ):  # fmt: skip
         count = taken.measurements.get(landmark, None if landmark >= UNNAMED else 0)
@@ -174,7 +173,7 @@ def write_geojson(
 ) -> FilePath:
     """Write map.geojson (RFC 7946); return it. sigma_m: larger semi-axis of the 1σ ellipse."""
     places = geodetic_from_local(datum, fused.means)[:, ::-1].tolist()
-    sigmas = np.sqrt(np.linalg.eigvalsh(landmark_blocks(fused.covariance))[:, 1]).tolist()
+    sigmas = np.sqrt(np.linalg.eigvalsh(translate.blocks_of(fused.covariance))[:, 1]).tolist()
     features = [
         _feature("Point", place, {"landmark": landmark, "sigma_m": sigma})
         for landmark, place, sigma in zip(fused.ids.tolist(), places, sigmas, strict=True)

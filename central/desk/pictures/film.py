@@ -10,7 +10,6 @@ from teamslam.central.desk.drawing import (
     MAP_COLOUR,
     TRUE_LANDMARK_COLOUR,
     draw_ellipses,
-    landmark_blocks,
     robot_colours,
 )
 from teamslam.central.desk.evaluation.results import Evaluation
@@ -61,7 +60,7 @@ def draw_film(
     paths = {n: r.online_path for n, r in evaluation.robots.items() if len(r.online_path.stamps_ns)}
     if fused is None or not len(fused.ids) or not paths:
         return False
-    final = landmark_blocks(fused.covariance)
+    final = translate.blocks_of(fused.covariance)
     times = magnification(evaluation, final)
     smoothed = [each.smoothed_path for each in evaluation.robots.values()]
     points = [each.poses[:, :2] for each in (*paths.values(), *smoothed)]

@@ -18,7 +18,6 @@ from teamslam.central.desk.drawing import (
     curve_through,
     draw_ellipses,
     ellipses,
-    landmark_blocks,
     robot_colours,
     robot_labels,
 )
@@ -26,6 +25,7 @@ from teamslam.central.desk.evaluation.errors import Path, transform_points
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
 from teamslam.central.desk.paths import SmoothedPath
 from teamslam.central.desk.pictures.style import save
+from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
@@ -215,7 +215,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     """
     truth, fused = evaluation.true_landmarks, evaluation.map
     has_map = fused is not None and len(fused.ids) > 0
-    blocks = landmark_blocks(fused.covariance) if fused is not None and has_map else None
+    blocks = translate.blocks_of(fused.covariance) if fused is not None and has_map else None
     times = 1 if fused is None or blocks is None else magnification(evaluation, blocks)
     if len(truth):
         drawn = truth if fused is None or times == 1 else _magnified_truth(truth, fused, times)

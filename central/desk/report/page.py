@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -15,56 +16,13 @@ from teamslam.central.desk.names import OUTSIDE, in_order
 from teamslam.central.desk.pictures.run import error_picture, map_picture
 from teamslam.central.desk.pictures.style import PAGE, SCREEN, Picture, Style, drawn_in
 from teamslam.central.desk.pictures.time import consistency_picture
+from teamslam.central.desk.report import tables
 from teamslam.central.desk.report.run import Run
-from teamslam.central.desk.report.tables import (
-    Sheet,
-    ape_sheet,
-    change_sheet,
-    consistency_sheet,
-    decision_sheet,
-    disposition_sheet,
-    is_unfused,
-    latency_sheet,
-    own_sheet,
-    path_sheet,
-    peer_sheet,
-    process_sheet,
-    robot_sheet,
-    score_sheet,
-    team_rows,
-    title_of,
-    traffic_sheet,
-)
 from teamslam.team.recording.provenance import version
 
 LISTED_EVENTS = 200
 """Most events in the page's table; report.json has all."""
 _ORIGIN = ("git.commit", "seed", "version.teamslam", "version.python")
-
-_STYLE = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { font: 16px/1.5 system-ui, sans-serif; color: #1b1b1b; max-width: 62rem; margin: 0 auto;
-  padding: 1rem; }
-h1 { font-size: 1.5rem; line-height: 1.25; } h2 { font-size: 1.2rem; margin: 2rem 0 .5rem; }
-nav { font-size: .9rem; } nav a { margin-right: .8rem; white-space: nowrap; display: inline-block; }
-a { color: #0b5ea8; }
-table { border-collapse: collapse; margin: .5rem 0 1rem; display: block; overflow-x: auto;
-  font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: .25rem .6rem; border-bottom: 1px solid #ddd;
-  vertical-align: top; white-space: pre-line; }
-th:first-child, td:first-child, table.words td, table.words th {
-  text-align: left; }
-table.words td:first-child { white-space: nowrap; }
-figure { margin: 1rem 0; overflow-x: auto; }
-img { width: 100%; height: auto; } img.wide { min-width: 34rem; }
-p.note { color: #555; font-size: .9rem; } .good { color: #1c6e2c; } .bad { color: #b00020; }
-details { margin: 1rem 0; } summary { cursor: pointer; font-weight: 600; }
-pre { overflow-x: auto; background: #f6f6f6; padding: .6rem; font-size: .85rem; }
-@media (max-width: 40rem) {
-  body { padding: .6rem; font-size: 15px; } td, th { padding: .2rem .4rem; }
-}
-"""
 
 
 def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str, Path]:
@@ -105,31 +63,33 @@ def _page(
     run: Run, pictures: Mapping[str, Path], processes: Mapping[str, Mapping[str, float | None]]
 ) -> str:
     evaluation = run.evaluation
-    title = escape(title_of(evaluation))
-    own, robots = is_unfused(evaluation), bool(evaluation.robots)
+    title = escape(tables.title_of(evaluation))
+    own = _sheet(tables.own_sheet(evaluation)) if tables.is_unfused(evaluation) else ""
+    robots = bool(evaluation.robots)
     sections = {
-        "Map": [_image(pictures, "map", wide=False), _sheet(own_sheet(evaluation)) if own else ""],
-        "Robots": [_sheet(robot_sheet(evaluation)), _image(pictures, "errors")] if robots else [],
+        "Map": [_image(pictures, "map", wide=False), own],
+        "Robots": [_sheet(tables.robot_sheet(evaluation)), _image(pictures, "errors")] * robots,
         "Landmarks": _landmarks(run),
-        "Peers": [_sheet(peer_sheet(evaluation))] if evaluation.peers else [],
+        "Peers": [_sheet(tables.peer_sheet(evaluation))] if evaluation.peers else [],
         "Consistency": _consistency(run, pictures),
         "Paths": _paths(run),
         "Measurements": _measurements(run),
         "Events": _events(run),
-        "Latency": [_sheet(latency_sheet(run))] if run.history.latencies else [],
+        "Latency": [_sheet(tables.latency_sheet(run))] if run.history.latencies else [],
         "Traffic": _traffic(run),
-        "Processes": [_sheet(process_sheet(processes))] if processes else [],
+        "Processes": [_sheet(tables.process_sheet(processes))] if processes else [],
         "Origin": _origin(run),
     }
     there = {name: text for name, of in sections.items() if (text := "\n".join(filter(None, of)))}
     links = "".join(f'<a href="#{name.lower()}">{name}</a>' for name in there)
     body = "\n".join(f'<h2 id="{name.lower()}">{name}</h2>\n{text}' for name, text in there.items())
     notes = "\n".join(f"<p>{escape(note)}</p>" for note in evaluation.notes)
+    style = files("teamslam.central.desk.report").joinpath("page.css").read_text("utf-8")
     return (
         f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}</title>\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<style>{_STYLE}</style>\n<h1>{title}</h1>\n{_describe_origin(run)}\n<nav>{links}</nav>\n"
-        f"{_table((), team_rows(evaluation), words=True)}\n{notes}\n{body}\n</html>\n"
+        f"<style>\n{style}</style>\n<h1>{title}</h1>\n{_describe_origin(run)}\n<nav>{links}</nav>\n"
+        f"{_table((), tables.team_rows(evaluation), words=True)}\n{notes}\n{body}\n</html>\n"
     )
 
 
@@ -149,33 +109,33 @@ def _date(seconds: float) -> str:
 
 def _landmarks(run: Run) -> list[str]:
     evaluation = run.evaluation
-    parts = [] if evaluation.association is None else [score_sheet(evaluation.association)]
+    parts = [] if evaluation.association is None else [tables.score_sheet(evaluation.association)]
     changes = () if evaluation.map is None else evaluation.map.changes
     if any(each.state != "unchanged" for each in changes):
-        parts.append(change_sheet(changes))
-    parts += [decision_sheet(evaluation.decisions)] if evaluation.decisions else []
+        parts.append(tables.change_sheet(changes))
+    parts += [tables.decision_sheet(evaluation.decisions)] if evaluation.decisions else []
     return [*map(_sheet, parts)]
 
 
 def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    sheet = consistency_sheet(run)
+    sheet = tables.consistency_sheet(run)
     if not sheet.rows and "consistency" not in pictures:
         return []
     return [_sheet(sheet), _image(pictures, "consistency")]
 
 
 def _paths(run: Run) -> list[str]:
-    sheet = path_sheet(run.evaluation)
+    sheet = tables.path_sheet(run.evaluation)
     if all(cell in {"–", OUTSIDE} for row in sheet.rows for cell in row[1:]):
         return []
-    return [_sheet(sheet), _sheet(ape_sheet(run))]
+    return [_sheet(sheet), _sheet(tables.ape_sheet(run))]
 
 
 def _measurements(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
-        table = _sheet(disposition_sheet(ledgers)) if any(ledgers.values()) else ""
+        table = _sheet(tables.disposition_sheet(ledgers)) if any(ledgers.values()) else ""
         return [table, _note(f"As reported by the robots. The ledger: {run.no_ledger}.")]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
@@ -185,7 +145,7 @@ def _measurements(run: Run) -> list[str]:
         verdict = f"{len(ledger.offenders)} offenders: {'; '.join(ledger.offenders[:5])}"
     return [
         f'<p class="{kind}">Ledger: {escape(verdict)}.</p>',
-        _sheet(disposition_sheet({robot: ledger.totals(robot) for robot in robots})),
+        _sheet(tables.disposition_sheet({robot: ledger.totals(robot) for robot in robots})),
         _note(f"{len(ledger.maps)} submaps, {used} of them in a map"),
     ]
 
@@ -207,7 +167,7 @@ def _events(run: Run) -> list[str]:
 
 
 def _traffic(run: Run) -> list[str]:
-    sheet = traffic_sheet(run)
+    sheet = tables.traffic_sheet(run)
     summary = f"<summary>Every key ({len(sheet.rows)})</summary>"
     return [f"<details>{summary}{_sheet(sheet)}</details>"] if sheet.rows else []
 
@@ -246,7 +206,7 @@ def _note(text: str) -> str:
     return f'<p class="note">{shown}</p>'
 
 
-def _sheet(sheet: Sheet) -> str:
+def _sheet(sheet: tables.Sheet) -> str:
     note = f"\n{_note(sheet.note)}" if sheet.note else ""
     return _table(sheet.headings, sheet.rows) + note
 

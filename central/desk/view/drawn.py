@@ -1,10 +1,10 @@
 """Drawable contents of a team's messages."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.team import translate
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
@@ -39,16 +39,7 @@ def centre_particles(cloud: m.ParticleCloud) -> Float[np.ndarray, "P 2"]:
     x, y = np.average(poses[:, :2], axis=0, weights=weights)
     c, s = (np.average(f(poses[:, 2]), weights=weights) for f in (np.cos, np.sin))
     heading = np.arctan2(s, c)
-    return place_points(poses[:, :2] - (x, y), (0.0, 0.0, -float(heading)))
-
-
-def place_points(
-    points: Float[np.ndarray, "P 2"], pose: Sequence[float]
-) -> Float[np.ndarray, "P 2"]:
-    """Transform points to the frame of the pose (x, y, theta)."""
-    x, y, theta = pose
-    c, s = np.cos(theta), np.sin(theta)
-    return np.asarray(points @ np.array([[c, s], [-s, c]]) + (x, y))
+    return transform_points(np.array((0.0, 0.0, -float(heading))), poses[:, :2] - (x, y))
 
 
 @dataclass

@@ -20,7 +20,6 @@ from teamslam.central.desk.view.drawn import (
     Track,
     centre_particles,
     landmarks_of,
-    place_points,
 )
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.shapes import Float
@@ -264,7 +263,7 @@ class ViewerNode:
             yield views.ROBOT.key(name), msgspec.json.encode(_figures(robot, now_ns))
         for name, robot in seen.items():
             if robot.cloud is not None:
-                points = place_points(centre_particles(robot.cloud), robot.pose().tolist())
+                points = transform_points(robot.pose(), centre_particles(robot.cloud))
                 weights = floats(robot.cloud.weights, "weights").astype(np.float64)
                 yield views.PARTICLES.key(name), fox.cloud(now_ns, points, weights, "weight")
                 robot.cloud = None

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teamslam.central.desk.drawing import ROBOT_COLOURS
+from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
 from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment
 from teamslam.central.desk.names import data_set_of
@@ -30,10 +31,10 @@ from teamslam.central.desk.view.drawn import (
     Landmarks,
     centre_particles,
     landmarks_of,
-    place_points,
 )
 from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
 from teamslam.central.unnamed_landmarks import SHOWN, STEPS
+from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
@@ -74,7 +75,7 @@ class _Stream:
     frame: str | None = None
     pose_ns: int | None = None
     truth_ns: int | None = None
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     seen_ns: dict[int | str, int] = field(default_factory=dict)
     rows: dict[str, tuple[list[float], list[float | str]]] = field(default_factory=dict)
 
@@ -239,10 +240,10 @@ class PageFrames:
     def _take_sensor(self, message: m.Configuration) -> None:
         sensor = json.loads(message.configuration).get("sensor", {})
         robot = message.node.removeprefix("robot/")
-        x, y, heading = sensor.get("mount", (0.0, 0.0, 0.0))
-        self._streams[robot].mount = (x, y, heading)
+        mount = sensor.get("mount", (0.0, 0.0, 0.0))
+        self._streams[robot].mount = np.array(mount)
         within = {"range": sensor.get("max_range"), "view": sensor.get("field_of_view")}
-        self._add_frame("sensor", r=robot, mount=(x, y, heading), **within)
+        self._add_frame("sensor", r=robot, mount=mount, **within)
 
     def _take_measurements(
         self, message: m.Observations | m.Points | m.Detections | m.Sightings
@@ -265,7 +266,8 @@ class PageFrames:
                 names = ids(message.ids, "ids").tolist()
         due = {name for name in names if at >= stream.seen_ns.get(name, -SEEN_NS) + SEEN_NS}
         stream.seen_ns |= dict.fromkeys(due, at)
-        for name, (x, y) in zip(names, place_points(places, stream.mount).tolist(), strict=True):
+        seen = transform_points(stream.mount, places)
+        for name, (x, y) in zip(names, seen.tolist(), strict=True):
             if name in due:
                 stream.add("see", self._t(at), [name, round(x, 3), round(y, 3)])
 

@@ -7,11 +7,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from teamslam.central.desk.evaluation.errors import map_errors
+from teamslam.central.desk.evaluation.errors import map_errors, transform_points
 from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks
 from teamslam.central.desk.view.drawn import (
     centre_particles,
-    place_points,
 )
 from teamslam.central.desk.view.export import export_views, with_views
 from teamslam.central.desk.view.node import LAG_NS, PERIOD_NS, ViewerNode
@@ -230,4 +229,5 @@ def test_a_cloud_is_drawn_around_the_robot_wherever_its_own_frame_has_drifted():
     heading = float(np.arctan2(*(np.average(f(poses[:, 2]), weights=weights)
                                  for f in (np.sin, np.cos))))  # fmt: skip
     mean = np.average(poses[:, :2], axis=0, weights=weights)
-    np.testing.assert_allclose(place_points(seen, (*mean, heading)), poses[:, :2], atol=1e-12)
+    placed = transform_points(np.array((*mean, heading)), seen)
+    np.testing.assert_allclose(placed, poses[:, :2], atol=1e-12)
