@@ -29,22 +29,14 @@ from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
-from teamslam.team.wire import messages as m
 
 # Matplotlib takes half a second to import.
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DRAWN_ROBOTS = 12
-"""Most rows of the error picture."""
-DRAWN_POINTS = 4000
-"""Most points of a line; longer paths are thinned."""
-DRAWN_ERRORS = 1200
-"""Most points of a panel of errors."""
-DRAWN_BARS = 60
-"""Most error bars."""
-LABELLED_LANDMARKS = 60
+DRAWN_ROBOTS, DRAWN_POINTS, DRAWN_ERRORS, DRAWN_BARS, LABELLED_LANDMARKS = 12, 4000, 1200, 60, 60
+"""Most rows of the error picture, points of a line, of a panel of errors, error bars, labels."""
 CHANGE_MARKS = {
     "moved": (ORANGE, "o", 140.0, "-"),
     "gone": (VERMILION, "o", 110.0, "--"),
@@ -85,16 +77,16 @@ def map_picture(
     if smoothed:
         axis.plot([], [], color=TRUTH_COLOUR, marker="o", linestyle="", label="ends of submaps")
     axis.plot([], [], color=TRUTH_COLOUR, marker="s", markersize=9, linestyle="", label="starts")
-    handles, _ = axis.get_legend_handles_labels()
-    figure.legend(
-        *axis.get_legend_handles_labels(),
-        loc="outside lower center",
-        ncols=min(4, -(-len(handles) // 2)),
-        frameon=False,
-        fontsize=10,
-    )
+    _add_legend(figure, axis, min(4, -(-len(axis.get_legend_handles_labels()[0]) // 2)))
     save(figure, path)
     return True
+
+
+def _add_legend(figure: "Figure", axis: "Axes", columns: int) -> None:
+    figure.legend(
+        *axis.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False,
+        fontsize=10,
+    )  # fmt: skip
 
 
 def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
@@ -141,8 +133,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     more = f" · {left_out} more robots are not drawn" if left_out else ""
     more += f" · not in the team's frame: {', '.join(outside)}" if outside else ""
     figure.suptitle(f"{_heading(evaluation)}: pose errors and their 3σ bounds{more}")
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=10)
+    _add_legend(figure, axes[0][0], 4)
     save(figure, path)
     return True
 
@@ -226,8 +217,8 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
         )  # fmt: skip
     if fused is None or blocks is None:
         return
-    changes = {each.landmark: each for each in fused.changes}
-    there = np.array([_state(changes, landmark) != "gone" for landmark in fused.ids.tolist()])
+    gone = [each.landmark for each in fused.changes if each.state == "gone"]
+    there = ~np.isin(fused.ids, gone)
     label = "landmarks, 95 % ellipses" + (f" × {times}" if times > 1 else "")
     label += "\nwith the frame's own error" if evaluation.arbitrary_frame else ""
     axis.plot(
@@ -237,33 +228,20 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     draw_ellipses(
         axis, fused.means[there], times**2 * blocks[there], MAP_COLOUR, width=1.1, zorder=7
     )
-    places = _draw_changes(axis, fused, changes)
+    places = _draw_changes(axis, fused)
     named = fused.ids < UNNAMED  # numbers of unnamed landmarks have no meaning
     if 0 < np.count_nonzero(named) <= LABELLED_LANDMARKS:
         means = places[named]
-        for landmark, mean, offset in zip(
-            fused.ids[named], means, label_offsets(means), strict=True
+        for landmark, at, offset in zip(
+            fused.ids[named], means.tolist(), _label_offsets(means).tolist(), strict=True
         ):
             axis.annotate(
-                str(landmark),
-                (float(mean[0]), float(mean[1])),
-                xytext=(float(offset[0]), float(offset[1])),
-                textcoords="offset points",
-                ha="center",
-                va="center",
-                fontsize=9,
-                color=MAP_COLOUR,
-                zorder=8,
-            )
+                str(landmark), at, xytext=offset, textcoords="offset points", ha="center",
+                va="center", fontsize=9, color=MAP_COLOUR, zorder=8,
+            )  # fmt: skip
 
 
-def _state(changes: Mapping[int, m.LandmarkChange], landmark: int) -> str:
-    return changes[landmark].state if landmark in changes else "unchanged"
-
-
-def _draw_changes(
-    axis: "Axes", fused: MapResult, changes: Mapping[int, m.LandmarkChange]
-) -> Float[np.ndarray, "L 2"]:
+def _draw_changes(axis: "Axes", fused: MapResult) -> Float[np.ndarray, "L 2"]:
     """Mark changes since the saved maps; return each landmark's place.
 
     As on the live page: an arrow from a moved one's old place to a ring, a hollow dashed mark at
@@ -271,18 +249,18 @@ def _draw_changes(
     """
     places = fused.means.copy()
     found: dict[str, list[int]] = {state: [] for state in CHANGE_MARKS}
+    changes = {each.landmark: each for each in fused.changes if each.state in found}
     for row, landmark in enumerate(fused.ids.tolist()):
-        state = _state(changes, landmark)
-        if state not in found:
+        if (change := changes.get(landmark)) is None:
             continue
-        found[state].append(row)
-        before = fused.means[row] - (changes[landmark].dx, changes[landmark].dy)
-        if state == "gone":
+        found[change.state].append(row)
+        before = fused.means[row] - (change.dx, change.dy)
+        if change.state == "gone":
             places[row] = before
-        elif state == "moved":
+        elif change.state == "moved":
             axis.annotate(
                 "", xy=fused.means[row].tolist(), xytext=before.tolist(), zorder=9,
-                arrowprops={"arrowstyle": "-|>", "color": CHANGE_MARKS[state][0], "linewidth": 1.6},
+                arrowprops={"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.6},
             )  # fmt: skip
     for state, (colour, marker, size, dashes) in CHANGE_MARKS.items():
         if found[state]:
@@ -313,8 +291,8 @@ def _magnified_truth(
     return np.vstack([moved, *kept]) if kept else moved
 
 
-def label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
-    """Label offset of each point [typographic points], away from its neighbours."""
+def _label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
+    """Offset of each point's label [typographic points], away from its neighbours."""
     reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
     offsets = np.empty_like(points)
     for i, point in enumerate(points):
@@ -333,7 +311,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
         axis.set_axisbelow(True)
         shown, largest = [np.empty(0)], 0.0
         if robot.online is not None:
-            drawn = thinning(len(robot.online.stamps_ns), DRAWN_ERRORS)
+            drawn = slice(None, None, max(1, len(robot.online.stamps_ns) // DRAWN_ERRORS))
             time_s = (robot.online.stamps_ns[drawn] - start_ns) * 1e-9
             bound = 3.0 * scale * robot.online.sigmas[drawn, k]
             error = scale * robot.online.errors[drawn, k]
@@ -378,13 +356,8 @@ def _first_ns(robot: RobotResult) -> int:
 
 
 def _thinned(path: Path) -> Path:
-    drawn = thinning(len(path.stamps_ns))
+    drawn = slice(None, None, max(1, len(path.stamps_ns) // DRAWN_POINTS))
     return Path(path.stamps_ns[drawn], path.poses[drawn])
-
-
-def thinning(count: int, most: int = DRAWN_POINTS) -> slice:
-    """Slice that leaves about this many points."""
-    return slice(None, None, max(1, count // most))
 
 
 def _heading(evaluation: Evaluation) -> str:
@@ -398,13 +371,13 @@ def _title(evaluation: Evaluation) -> list[str]:
         second.append("no final map")
     elif fused.errors is not None:
         errors = fused.errors
+        aligned = "" if errors.aligned_rmse_m is None else f"{errors.aligned_rmse_m:.3g} m"
         if evaluation.arbitrary_frame:
-            aligned = "" if errors.aligned_rmse_m is None else f"{errors.aligned_rmse_m:.3g} m"
-            return [_heading(evaluation), " · ".join([*second, f"landmark RMSE {aligned} aligned"])]
-        text = f"landmark RMSE {errors.rmse_m:.3g} m"
-        if errors.aligned_rmse_m is not None:
-            text += f" ({errors.aligned_rmse_m:.3g} m aligned)"
-        if fused.matching is not None:
-            text += f", {fused.matching.by}"
-        second += [text, f"map NEES per dof {errors.nees_per_dof:.3g}"]
+            second.append(f"landmark RMSE {aligned} aligned")
+        else:
+            text = f"landmark RMSE {errors.rmse_m:.3g} m" + (
+                f" ({aligned} aligned)" * bool(aligned)
+            )
+            text += "" if fused.matching is None else f", {fused.matching.by}"
+            second += [text, f"map NEES per dof {errors.nees_per_dof:.3g}"]
     return [_heading(evaluation), " · ".join(second)]

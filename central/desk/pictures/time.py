@@ -5,13 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from teamslam.central.desk.drawing import (
-    MAP_COLOUR,
-    ORANGE,
-    RED,
-    robot_colours,
-    robot_labels,
-)
+from teamslam.central.desk.drawing import MAP_COLOUR, ORANGE, RED, robot_colours, robot_labels
 from teamslam.central.desk.evaluation.history import History
 from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.pictures.run import new_figure
@@ -31,7 +25,7 @@ LOGARITHMIC_FROM = 12.0
 """NEES from which the axis is logarithmic."""
 
 
-def sum_in_bins(
+def _sum_in_bins(
     history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
     """Sum each value over the filled ones of BINS intervals; return their middles [s] and sums."""
@@ -45,17 +39,13 @@ def sum_in_bins(
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
     """Draw NEES, NIS and joint cost per dof over team time; False if all are empty."""
+    has_poses = any(r.online for r in evaluation.robots.values()) and not evaluation.arbitrary_frame
+    has_nis = any(each.per_dof is not None for each in history.innovations.values())
     panels = [
-        draw
-        for draw, is_there in (
-            (_draw_nees, (any(r.online for r in evaluation.robots.values())
-              and not evaluation.arbitrary_frame)
-             or len(history.map_nees.values) > 0),
-            (_draw_nis, any(i.per_dof is not None for i in history.innovations.values())),
-            (_draw_cost, len(history.map_cost.values) > 0),
-        )
-        if is_there
-    ]  # fmt: skip
+        *[_draw_nees] * (has_poses or len(history.map_nees.values) > 0),
+        *[_draw_nis] * has_nis,
+        *[_draw_cost] * (len(history.map_cost.values) > 0),
+    ]
     if not panels:
         return False
     figure, axes = new_figure(9.0, 0.6 + 2.9 * len(panels), len(panels), 1)
@@ -80,7 +70,7 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         if robot.online is None or evaluation.arbitrary_frame:
             continue
         nees, ones = robot.online.nees / 3.0, np.ones(len(robot.online.nees))
-        centres, (sums, counts) = sum_in_bins(history, robot.online.stamps_ns, nees, ones)
+        centres, (sums, counts) = _sum_in_bins(history, robot.online.stamps_ns, nees, ones)
         axis.plot(centres, sums / counts, color=colours[name], linewidth=1.2, label=labels[name])
         largest = max(largest, float((sums / counts).max()))
     of_map = history.map_nees
@@ -90,18 +80,16 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         largest = max(largest, float(of_map.values.max()))
     _scale(axis, max(largest, high))
     axis.set_ylabel("NEES per dof")
-    axis.set_title(
-        "NEES: squared errors in units of their covariance; 1 is consistent", fontsize=10
-    )
+    title = "NEES: squared errors in units of their covariance; 1 is consistent"
+    axis.set_title(title, fontsize=10)
 
 
 def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     largest, lows, highs = 0.0, [], []
     colours, labels = robot_colours(evaluation.robots), robot_labels(history.innovations)
     for name, of in history.innovations.items():
-        centres, (squared, dof) = sum_in_bins(
-            history, of.stamps_ns, of.squared, of.dof.astype(np.float64)
-        )
+        each = of.squared, of.dof.astype(np.float64)
+        centres, (squared, dof) = _sum_in_bins(history, of.stamps_ns, *each)
         measured: Bool[np.ndarray, " b"] = dof > 0
         if not measured.any():
             continue
@@ -129,9 +117,8 @@ def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         (WARN, ORANGE, "covariances too small"),
         (FAIL, RED, "covariances not to be trusted"),
     ):
-        axis.axhline(
-            level, color=colour, linewidth=0.9, linestyle="--", label=f"above {level}: {name}"
-        )
+        label = f"above {level}: {name}"
+        axis.axhline(level, color=colour, linewidth=0.9, linestyle="--", label=label)
     largest = FAIL
     colours, labels = robot_colours(evaluation.robots), robot_labels(history.robot_cost)
     for name, of in history.robot_cost.items():
