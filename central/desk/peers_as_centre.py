@@ -19,7 +19,6 @@ from teamslam.team.wire.bus import Sample, try_open
 from teamslam.team.wire.codec import WireError, decoded, encoded
 
 OF_AGREEMENT = (ch.TEAM_CONFIG, ch.TEAM_FINAL, ch.CONCLUDED, ch.GIVEN_UP, ch.ORDER)
-_NAMES = frozenset(channel.name for channel in OF_AGREEMENT)
 
 
 class Agreement:
@@ -37,10 +36,7 @@ class Agreement:
 
     def take(self, sample: Sample) -> None:
         """Process a sample; ignore other channels and invalid samples."""
-        found = ch.channel_of(sample.key)
-        if found is None or found[0].name not in _NAMES:
-            return
-        if (sound := try_open(sample)) is None:
+        if ch.row_of(sample.key) not in OF_AGREEMENT or (sound := try_open(sample)) is None:
             return
         channel, name, message = sound
         if channel is ch.TEAM_CONFIG:
@@ -102,18 +98,18 @@ class Agreement:
         for robot in self.needed:
             of, published = self.of(robot), self._finals.get(robot)
             if of is None:
-                found.append(f"the peers do not agree: {robot} has announced no final map")
+                found.append(f"{robot} has announced no final map")
             elif of != sha256:
                 found.append(
-                    f"the peers do not agree: {robot} has another final map, {of.hex()[:12]}, "
-                    f"than most of them, {sha256.hex()[:12]}"
+                    f"{robot} has another final map, {of.hex()[:12]}, than most of them, "
+                    f"{sha256.hex()[:12]}"
                 )
             elif published is not None and published[0] != of:
                 found.append(
-                    f"the peers do not agree: {robot} has published another final map, "
-                    f"{published[0].hex()[:12]}, than the one with which it concluded"
+                    f"{robot} has published another final map, {published[0].hex()[:12]}, than the "
+                    "one with which it concluded"
                 )
-        return tuple(found)
+        return tuple(f"the peers do not agree: {each}" for each in found)
 
 
 def as_centre_final(sample: Sample) -> Sample:
@@ -121,14 +117,11 @@ def as_centre_final(sample: Sample) -> Sample:
     return msgspec.structs.replace(sample, key=ch.FINAL_MAP.key())
 
 
-_CENTRE = frozenset({ch.FUSED_MAP.key(), ch.FINAL_MAP.key()})
-_TOKEN = ch.ALIVE.key("central")
 _AS = {
-    ch.TEAM_CONFIG.name: ch.CENTRAL_CONFIG,
-    ch.TEAM_MAP.name: ch.FUSED_MAP,
-    ch.TEAM_PRIOR.name: ch.PRIOR,
-    ch.TEAM_TRAJECTORY.name: ch.TRAJECTORY,
-    ch.TEAM_WITHDRAWAL.name: ch.WITHDRAWAL,
+    ch.TEAM_MAP: ch.FUSED_MAP,
+    ch.TEAM_PRIOR: ch.PRIOR,
+    ch.TEAM_TRAJECTORY: ch.TRAJECTORY,
+    ch.TEAM_WITHDRAWAL: ch.WITHDRAWAL,
 }
 LISTENS = (
     ch.TEAM_MAP, ch.TEAM_PRIOR, ch.TEAM_TRAJECTORY, ch.TEAM_WITHDRAWAL, ch.WORLD_CONFIG,
@@ -154,80 +147,60 @@ class PeersAsCentre:
 
     def of(self, sample: Sample) -> Sample | None:
         """Sample as a centre would publish it, or None."""
-        if sample.key in _CENTRE:
+        channel, name = ch.channel_of(sample.key) or (None, "")
+        if channel in (ch.FUSED_MAP, ch.FINAL_MAP):
             self._centre = True
-            self._concluded = self._concluded or sample.key == ch.FINAL_MAP.key()
-        elif sample.key == _TOKEN:
+            self._concluded = self._concluded or channel is ch.FINAL_MAP
+        elif channel is ch.ALIVE and name == "central":
             token = _decoded(sample, m.Liveliness)
             self._centre = self._centre and (token is None or token.alive)
-        found = ch.channel_of(sample.key)
-        if found is None:
-            return None
-        channel, name = found
-        if channel is ch.WORLD_CONFIG and not self._is_told:
-            self._learn(sample)
+        elif channel is ch.WORLD_CONFIG and not self._is_told:
+            self._take_robots(sample)
         if self.agreement.robots is not None and not self.agreement.robots:
             return None
         self.agreement.take(sample)
-        if self._centre and (self._concluded or channel not in _LAST):
+        if channel is None or (self._centre and (self._concluded or channel not in _LAST)):
             return None
-        if channel is ch.TEAM_FINAL or channel is ch.CONCLUDED:
-            return self._agreed()
-        if channel is ch.STATUS:
-            return self._status(sample, name)
-        return self._renamed(sample, channel, name)
-
-    def _renamed(self, sample: Sample, channel: ch.Channel, name: str) -> Sample | None:
-        as_channel = _AS.get(channel.name)
-        if as_channel is None:
-            return None
+        if channel in (ch.TEAM_FINAL, ch.CONCLUDED):
+            agreed = self.agreement.agreed
+            if agreed is None or agreed.payload == self._final:
+                return None
+            self._final = agreed.payload
+            return as_centre_final(agreed)
         if channel in (ch.TEAM_MAP, ch.TEAM_CONFIG):
             self._robot = name if self._robot is None else self._robot
             if name != self._robot:
                 return None
-        if channel is ch.TEAM_WITHDRAWAL:
-            order = _decoded(sample, m.Withdrawal)
-            name = name if order is None else order.robot
-        renamed = msgspec.structs.replace(sample, key=as_channel.key(name))
-        return self._spoken(renamed) if channel is ch.TEAM_CONFIG else renamed
+        return self._renamed(sample, channel, name)
 
-    def _learn(self, sample: Sample) -> None:
+    def _renamed(self, sample: Sample, channel: ch.Channel, name: str) -> Sample | None:
+        if channel is ch.TEAM_CONFIG:
+            if (config := _decoded(sample, m.Configuration)) is None:
+                return None
+            own: m.Message = msgspec.structs.replace(config, node="central")
+            return _with_message(sample, ch.CENTRAL_CONFIG.key(name), own)
+        if channel is ch.STATUS:
+            status = _decoded(sample, m.Status)
+            if status is None or self._robot is None or name != ch.robot_node(self._robot):
+                return None
+            folding = (each for each in status.figures.items() if each[0].startswith(_FOLD))
+            figures = {figure.removeprefix(_FOLD): value for figure, value in folding}
+            own = m.Status(
+                stamp_ns=status.stamp_ns, node="central", state=status.state, figures=figures
+            )
+            return _with_message(sample, ch.STATUS.key("central"), own)
+        if channel is ch.TEAM_WITHDRAWAL and (order := _decoded(sample, m.Withdrawal)) is not None:
+            name = order.robot
+        if (as_channel := _AS.get(channel)) is None:
+            return None
+        return msgspec.structs.replace(sample, key=as_channel.key(name))
+
+    def _take_robots(self, sample: Sample) -> None:
         message = _decoded(sample, m.Configuration)
-        if message is None:
-            return
         with suppress(ValueError):
-            team = team_config(message.configuration)
-            self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
-
-    def _agreed(self) -> Sample | None:
-        agreed = self.agreement.agreed
-        if agreed is None or agreed.payload == self._final:
-            return None
-        self._final = agreed.payload
-        return as_centre_final(agreed)
-
-    def _spoken(self, sample: Sample) -> Sample | None:
-        message = _decoded(sample, m.Configuration)
-        if message is None:
-            return None
-        as_centre = msgspec.structs.replace(message, node="central")
-        return msgspec.structs.replace(sample, payload=encoded(as_centre))
-
-    def _status(self, sample: Sample, node: str) -> Sample | None:
-        if self._robot is None or node != ch.robot_node(self._robot):
-            return None
-        status = _decoded(sample, m.Status)
-        if status is None:
-            return None
-        figures = {
-            name.removeprefix(_FOLD): value
-            for name, value in status.figures.items()
-            if name.startswith(_FOLD)
-        }
-        own = m.Status(
-            stamp_ns=status.stamp_ns, node="central", state=status.state, figures=figures
-        )
-        return msgspec.structs.replace(sample, key=ch.STATUS.key("central"), payload=encoded(own))
+            if message is not None:
+                team = team_config(message.configuration)
+                self.agreement.robots = frozenset(each.id for each in team.robots if team.peers)
 
 
 M = TypeVar("M", bound=m.Message)
@@ -240,10 +213,13 @@ def _decoded(sample: Sample, kind: type[M]) -> M | None:
         return None
 
 
+def _with_message(sample: Sample, key: str, message: m.Message) -> Sample:
+    return msgspec.structs.replace(sample, key=key, payload=encoded(message))
+
+
 def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
     """Yield samples, each followed by its counterpart in a centre's name."""
     for sample in samples:
         yield sample
-        counterpart = centre.of(sample)
-        if counterpart is not None:
+        if (counterpart := centre.of(sample)) is not None:
             yield counterpart

@@ -364,9 +364,7 @@ def _map_result(
             if not _is_refuted(each, errors, arbitrary=arbitrary)
         ),
         joined=message.joined,
-        withdrawn=message.withdrawn,
         covariance_scale=message.covariance_scale or None,
-        lost=message.lost,
         gospa=_gospa(means, errors, true.positions),
         matching=matching,
         changes=message.changes,

@@ -5,6 +5,7 @@ Measurements, most of a log, are counted by head and added to their stream's `Ti
 
 from collections import defaultdict
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -68,23 +69,18 @@ class Traffic:
 
 
 @dataclass
-class Measurements:
-    """Measurements of one robot as (incarnation, number)."""
-
-    all: set[tuple[int, int]] = field(default_factory=set)
-    odometry: set[tuple[int, int]] = field(default_factory=set)
-
-
-@dataclass
 class Collected:
     """Contents of a log by channel and robot.
 
-    samples: by key, decoded on demand. first_ns: wall clock of the first sample that has one.
-    disagreement: peers whose final map differs, as text.
+    measurements: whether each, by robot and (incarnation, number), is odometry. samples: by key,
+    decoded on demand. first_ns: wall clock of the first sample that has one. disagreement: peers
+    whose final map differs, as text.
     """
 
     traffic: dict[str, Traffic] = field(default_factory=lambda: defaultdict(Traffic))
-    measurements: dict[str, Measurements] = field(default_factory=lambda: defaultdict(Measurements))
+    measurements: dict[str, dict[tuple[int, int], bool]] = field(
+        default_factory=lambda: defaultdict(dict)
+    )
     latest: dict[str, Sample] = field(default_factory=dict)
     samples: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
     timed: dict[tuple[str, int], Timed] = field(default_factory=lambda: defaultdict(Timed))
@@ -160,21 +156,13 @@ class Collected:
         if head is None:
             self._refuse(sample)
             return
-        of_robot = self.measurements[robot]
-        name = (head.incarnation, head.number)
-        if name not in of_robot.all and head.tag in _TIMED_TAGS:
-            self._time(sample, robot)
-        of_robot.all.add(name)
-        if odometry:
-            of_robot.odometry.add(name)
-
-    def _time(self, sample: Sample, robot: str) -> None:
-        try:
-            message = decoded(sample.payload, *_TIMED)
-        except WireError:
-            return
-        if message.robot == robot:
-            self.timed[robot, message.incarnation].take(message)
+        of_robot, name = self.measurements[robot], (head.incarnation, head.number)
+        if name not in of_robot and head.tag in _TIMED_TAGS:
+            with suppress(WireError):
+                message = decoded(sample.payload, *_TIMED)
+                if message.robot == robot:
+                    self.timed[robot, message.incarnation].take(message)
+        of_robot[name] = odometry or of_robot.get(name, False)
 
 
 def collect_log(samples: Iterable[Sample]) -> Collected:

@@ -118,9 +118,7 @@ class MapResult:
     cost_per_dof: float | None
     reasons: tuple[str, ...]
     joined: tuple[str, ...] = ()
-    withdrawn: tuple[str, ...] = ()
     covariance_scale: float | None = None
-    lost: tuple[str, ...] = ()
     gospa: Gospa | None = None
     matching: Matching | None = None
     changes: tuple[m.LandmarkChange, ...] = ()

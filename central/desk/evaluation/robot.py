@@ -64,15 +64,15 @@ def _consumption(log: Collected, robot: str) -> Consumption:
     for incarnation in sorted(dones):
         for entry in dones[incarnation].ledger:
             ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.measurements
-    measurements = log.measurements.get(robot)
+    measurements = log.measurements.get(robot, {})
     consumed = sum(d.measurements for d in dones.values()) if dones else None
     are_disjoint = all(
         a.incarnation != b.incarnation or a.last_measurement < b.first_measurement
         for a, b in pairwise(submaps[name] for name in sorted(submaps))
     )
     return Consumption(
-        steps=0 if measurements is None else len(measurements.odometry),
-        published=0 if measurements is None else len(measurements.all),
+        steps=sum(measurements.values()),
+        published=len(measurements),
         consumed=consumed,
         submaps=len(submaps),
         ledger=ledger,
