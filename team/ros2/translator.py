@@ -151,11 +151,8 @@ class Translator:
                 return [Speeds(record.stamp_ns, record.forward, record.yaw_rate)]
             case TransformsRecord():
                 ours = (self.topics.odometry_frame, self.topics.base_frame)
-                return [
-                    Pose(t.stamp_ns, *planar(t))
-                    for t in record.transforms
-                    if (t.parent, t.child) == ours
-                ]
+                driven = [t for t in record.transforms if (t.parent, t.child) == ours]
+                return [Pose(t.stamp_ns, *planar(t)) for t in driven]
             case _:
                 self.dropped["no odometry in a message of the odometry topic"] += 1
                 return []
@@ -200,24 +197,22 @@ class Translator:
         return 0.0, 0.0
 
     def _detections(self, topic: str, record: Record) -> list[Measured]:
+        shared: bool | None = topic in self.owners.shared
         match record:
-            case TagsRecord() if not self._is_ours(record.frame, topic in self.owners.shared):
-                return []
             case TagsRecord():
-                tags = [(self._name(tag), tag.position, tag.covariance) for tag in record.tags]
-                return self._make_scans(record.stamp_ns, record.frame, tags)
+                scans = [record]
             case TransformsRecord():
-                found = []
-                shared = topic in self.owners.shared or None
-                for t in record.transforms:
-                    if self._is_tag(t) and self._is_ours(t.parent, shared):
-                        found += self._make_scans(
-                            t.stamp_ns, t.parent, [(t.child, t.position, None)]
-                        )
-                return found
+                shared = shared or None
+                tags = [t for t in record.transforms if self._is_tag(t)]
+                scans = [
+                    TagsRecord(t.stamp_ns, t.parent, (Tag(t.child, t.position, None),))
+                    for t in tags
+                ]
             case _:
                 self.dropped["no detection in a message of a detections topic"] += 1
                 return []
+        ours = (scan for scan in scans if self._is_ours(scan.frame, shared))
+        return [seen for scan in ours for seen in self._make_scans(scan)]
 
     def _is_tag(self, transform: Transform) -> bool:
         return transform.child in self.topics.landmarks or bool(TAG.match(transform.child))
@@ -263,34 +258,27 @@ class Translator:
         frames = {frame for frame in self._unclaimed if self.owners.owner(frame) is None}
         return self.owners.question(self.robot, frames) if frames and self.undecided else ""
 
-    def _make_scans(self, stamp_ns: int, frame: str, tags: list[tuple]) -> list[Measured]:  # type: ignore[type-arg]
-        mount = self._mount(frame)
-        landmarks: list[tuple[int, tuple[float, float], tuple[float, float, float] | None]] = []
-        teammates: list[tuple[str, tuple[float, float]]] = []
-        for name, position, block in tags:
-            number = self._number(name)
+    def _make_scans(self, scan: TagsRecord) -> list[Measured]:
+        mount = self._mount(scan.frame)
+        numbers, points, claimed = [], [], []
+        teammates, places = [], []
+        for tag in scan.tags:
+            number = self._number(self._name(tag))
             if number is None:
                 self.dropped["a detection whose name is no number and not in `landmarks`"] += 1
             elif str(number) in self.topics.teammates:
-                mate = self.topics.teammates[str(number)]
-                teammates.append((mate, mount.point(position)))
+                teammates.append(self.topics.teammates[str(number)])
+                places.append(mount.point(tag.position))
             else:
-                covariance = None if block is None else mount.covariance(block)
-                landmarks.append((number, mount.point(position), covariance))
+                numbers.append(number)
+                points.append(mount.point(tag.position))
+                claimed += [] if tag.covariance is None else [mount.covariance(tag.covariance)]
         found: list[Measured] = []
-        if landmarks or not teammates:
-            claimed = [c for _, _, c in landmarks if c is not None]
-            found.append(
-                Seen(
-                    stamp_ns,
-                    tuple(number for number, _, _ in landmarks),
-                    tuple(point for _, point, _ in landmarks),
-                    tuple(claimed) if len(claimed) == len(landmarks) else (),
-                )
-            )
+        if numbers or not teammates:
+            covariances = tuple(claimed) if len(claimed) == len(numbers) else ()
+            found.append(Seen(scan.stamp_ns, tuple(numbers), tuple(points), covariances))
         if teammates:
-            names = tuple(name for name, _ in teammates)
-            found.append(Seen(stamp_ns, names, tuple(point for _, point in teammates)))
+            found.append(Seen(scan.stamp_ns, tuple(teammates), tuple(places)))
         return found
 
     def _name(self, tag: Tag) -> str:
