@@ -263,7 +263,10 @@ class MemoryNetwork:
 
 
 class MemoryBus(Bus):
-    """A bus within one process: synchronous and deterministic; its wall clock is always zero."""
+    """A bus within one process: synchronous, deterministic, with the wall clock zero.
+
+    Samples stored for late joiners come first; `receive` never waits.
+    """
 
     def __init__(self, network: MemoryNetwork) -> None:
         self.dropped = 0
@@ -276,7 +279,6 @@ class MemoryBus(Bus):
         network.receivers.clear()
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and deliver at once."""
         counter = self._counters[out.key]
         self._counters[out.key] = counter + 1
         payload = encoded(out.message)
@@ -284,11 +286,9 @@ class MemoryBus(Bus):
         return len(payload)
 
     def publish_raw(self, sample: Sample) -> None:
-        """Deliver the sample at once, unchanged."""
         self._network.deliver(self, sample)
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribe to a channel; the samples stored for late joiners come first."""
         for key, stored in self._network.stored.items():
             if _is_of(channel, name, key) and not self._is_subscribed(key):
                 requested = list(stored) if whole or channel.delivery == "all" else [stored[-1]]
@@ -310,16 +310,13 @@ class MemoryBus(Bus):
         return self in self._network.receivers_of(key)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """Return the samples since the last call; never wait."""
         arrived = self.arrived  # one by one: another thread may be publishing
         return [arrived.popleft() for _ in range(len(arrived))]
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer queries, within `ask`."""
         self._network.answers.append((channel, name, answer))
 
     def ask(self, channel: Channel, name: str, request: m.Message, timeout_s: float) -> list[bytes]:
-        """Compute and return the payloads of the replies at once."""
         for answered, names, answer in self._network.answers:
             if answered is channel and _is_of(channel, names, channel.key(name)):
                 try:
@@ -329,13 +326,11 @@ class MemoryBus(Bus):
         return []
 
     def request(self, channel: Channel, name: str, request: m.Message) -> None:
-        """Send a query; `receive` returns the replies with its next samples."""
         for payload in self.ask(channel, name, request, 0.0):
             with suppress(WireError):  # invalid replies are dropped
                 self.arrived.append(read_reply(channel, name, payload, 0))
 
     def redeliver(self) -> None:
-        """Deliver the stored samples of whole subscriptions and of `all` channels again."""
         for key, stored in self._network.stored.items():
             row = row_of(key)
             if row is None or not self._is_subscribed(key):
@@ -344,24 +339,20 @@ class MemoryBus(Bus):
                 self.arrived.extend(sample for source, sample in stored if source is not self)
 
     def declare_alive(self, node: str) -> None:
-        """Hold a token."""
         sample = _token(node, alive=True)
         self._network.alive[node] = (self, sample)
         self._network.notify(self, sample)
 
     def watch_alive(self, node: str = "*") -> None:
-        """Receive changes of tokens, the present ones first."""
         self._want(ch.ALIVE, node)
         for source, sample in self._network.alive.values():
             if source is not self and self._is_subscribed(sample.key):
                 self.arrived.append(sample)
 
     def is_alive(self, node: str) -> bool:
-        """Return whether a bus holds the token."""
         return node in self._network.alive
 
     def close(self) -> None:
-        """Leave the network and withdraw the tokens."""
         self._network.buses.remove(self)
         self._network.receivers.clear()
         own = [node for node, (source, _) in self._network.alive.items() if source is self]

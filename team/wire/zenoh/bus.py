@@ -153,7 +153,6 @@ class ZenohBus:
                 pass
 
     def publish_totals(self) -> Tally | None:
-        """Publish the sample count of each key, this message included; None without a token."""
         if not self._tokens:
             return None
         node = next(iter(self._tokens))
@@ -170,10 +169,7 @@ class ZenohBus:
         return tally
 
     def publish(self, out: Outgoing) -> int:
-        """Encode and publish, stamped with the wall clock; return the payload's size [bytes].
-
-        Block while the link is busy; after ten seconds Zenoh drops the link and connects anew.
-        """
+        """Encode and publish; after ten seconds of a busy link Zenoh drops it and connects anew."""
         counter = self._counters.get(out.key, 0)
         self._counters[out.key] = counter + 1
         stamp_ns = out.message.stamp_ns
@@ -210,7 +206,6 @@ class ZenohBus:
             raise BusError(f"{sample.key}: not published, {error}") from error
 
     def subscribe(self, channel: Channel, name: str = "*", *, whole: bool = False) -> None:
-        """Subscribe once; whole: all samples that a `latest` channel's publishers still have."""
         self._check_open()
         if {(channel.name, "*"), (channel.name, name)} & self._requested:
             return
@@ -253,10 +248,9 @@ class ZenohBus:
             self._admit(item)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
-        """Return all samples since the last call, in order; wait at most `timeout_s` for the first.
+        """Return the samples since the last call, and answer the queries on the caller's thread.
 
-        Queries are answered here, on the caller's thread. Samples that arrive during the call are
-        left for the next, which bounds it for a fast team.
+        Samples that arrive during the call are left for the next, which bounds it for a fast team.
         """
         self._check_open()
         self._link.look(time.monotonic())
@@ -315,21 +309,15 @@ class ZenohBus:
             samples += self._recovery.take_sample(sample, item.source_info)
 
     def redeliver(self) -> None:
-        """Request and deliver all samples of `all` channels and whole subscriptions again."""
         self._recovery.redeliver()
 
     def find_missing(self) -> dict[str, list[tuple[int, int]]]:
-        """Return the missing samples, available or not: by key, intervals of a publisher's
-        counters.
-        """
         return self._recovery.find_missing()
 
     def find_awaited(self) -> set[str]:
-        """Return the keys with missing samples that their publisher may still have."""
         return self._recovery.find_awaited()
 
     def answer(self, channel: Channel, name: str, answer: Answer) -> None:
-        """Answer the queries of `channel` within `receive`; a ValueError's text is the reply."""
         self._check_open()
 
         def take(query: zenoh.Query) -> None:
@@ -340,10 +328,7 @@ class ZenohBus:
         )
 
     def ask(self, channel: Channel, name: str, request: Message, timeout_s: float) -> list[bytes]:
-        """Query and return the replies' payloads in order; raises `BusError`.
-
-        Meanwhile this bus answers no queries.
-        """
+        """Query as a bus does; meanwhile this one answers no queries."""
         self._check_open()
         key = self._prefix + channel.key(name)
         payloads: list[bytes] = []
@@ -361,7 +346,6 @@ class ZenohBus:
         return payloads
 
     def request(self, channel: Channel, name: str, request: Message) -> None:
-        """Query without waiting, unless the same query is open; `receive` returns the replies."""
         self._check_open()
         if (channel.name, name) in self._open_queries:
             return
@@ -398,14 +382,12 @@ class ZenohBus:
             return []
 
     def declare_alive(self, node: str) -> None:
-        """Hold a liveliness token until the bus is closed or its process dies."""
         self._check_open()
         if node not in self._tokens:
             key = self._prefix + ALIVE.key(node)
             self._tokens[node] = self._session.liveliness().declare_token(key)
 
     def watch_alive(self, node: str = "*") -> None:
-        """Receive `Liveliness` samples of other nodes' tokens, present ones first."""
         self._check_open()
 
         def notice(sample: zenoh.Sample) -> None:
@@ -417,7 +399,6 @@ class ZenohBus:
             )
 
     def is_alive(self, node: str) -> bool:
-        """Return whether the router has the node's liveliness token."""
         self._check_open()
         key = self._prefix + ALIVE.key(node)
         replies = self._session.liveliness().get(key, timeout=_ALIVE_TIMEOUT_S)
