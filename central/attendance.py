@@ -183,9 +183,8 @@ class TeamAttendance:
 
     @property
     def end(self) -> m.End | None:
-        """The last counters of all streams; None while one is open.
-
-        In a live team that was ordered to end, a robot without a driver ends where it is done.
+        """The last counters of all streams, after an order to end from `Done`; None while one is
+        open.
         """
         if self.world_end is not None or not self.is_live:
             return self.world_end

@@ -273,8 +273,8 @@ def _shared_errors(
 
 
 def _student(sigmas: float, freedom: float) -> float:
-    """Multiple of an estimated standard deviation as rare as that of an exact one: t ≈ √(ν
-    (exp(z²/ν) − 1)) (Wallace 1959).
+    """Multiple of an estimated sigma as rare as of an exact one: t ≈ √(ν (exp(z²/ν) − 1)) (Wallace
+    1959).
     """
     if freedom == math.inf:
         return sigmas

@@ -46,9 +46,7 @@ STORED_DIGESTS = 4
 
 
 class _Filed(NamedTuple):
-    """A submap, the inter-robot measurements from it, the digest of both, and the errors of single
-    robots in a saved map.
-    """
+    """A submap, measurements from it, digest of both, and the own errors in a saved map."""
 
     submap: Submap
     sightings: Sequence[InterRobotFactor]
@@ -88,9 +86,8 @@ class FoldInputs:
         sightings: Sequence[SightingFactor],
         own: OwnBiases = NO_OWN,
     ) -> int:
-        """Add a submap; return the first tick that this changes.
-
-        The first fix adds the station, before all of the team's time.
+        """Add a submap, and with the first fix the station; return the first tick that this
+        changes.
         """
         factors = [translate.sighting_of(each) for each in sightings]
         tick = self._file(_Filed(submap, factors, digest, own))
@@ -164,8 +161,8 @@ class FoldInputs:
         return math.inf
 
     def contribution(self, key: Key) -> Contribution:
-        """Decode a submap, its covariance raised to the least. That of a saved map contains the
-        factor on the covariances of submaps already.
+        """Decode a submap, its covariance raised to the least; a saved map's contains the factor
+        already.
         """
         found = self._made.get(key)
         if found is None:
@@ -203,9 +200,7 @@ class FoldInputs:
         return submap_beyond(submap.local, bounds)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
-        """Return the members of a tick without some robots' submaps and measurements of these;
-        those beyond the bounds are refused.
-        """
+        """Return the members of a tick without some robots, and those refused beyond the bounds."""
         order = self.keys(tick - 1, tick, without)
         submaps = [self.contribution(key) for key in order]
         outside = {}

@@ -89,9 +89,7 @@ class Shown(NamedTuple):
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
-    """Select the landmarks of the map: in the final one unnamed ones only if well placed, found
-    again and known to be different.
-    """
+    """Select the landmarks of the map; the final one has unnamed ones only if surely different."""
     if not fold.contributions:
         return Shown()
     if tail != "final":
@@ -124,10 +122,7 @@ def reasons(
     *,
     is_explained: bool = False,
 ) -> tuple[str, ...]:
-    """List why robots and landmarks are not in the map, and warnings.
-
-    is_explained: the diagnosis names a cause of the misfit.
-    """
+    """List why robots and landmarks are not in the map, and warnings about the map."""
     diagnosed = (RIVAL, MISFIT) if is_explained else (RIVAL,)
     return (
         *_apart(fold),
@@ -206,9 +201,7 @@ def _listed(names: Sequence[str], most: int) -> str:
 def priors(
     fold: Fold, shown: Sequence[int], fused: m.FusedMap, requested: Collection[Stream]
 ) -> list[Outgoing]:
-    """Make the priors of these streams: in the team's map their estimate, else a message that
-    withdraws earlier priors, as all of a final map do.
-    """
+    """Make the priors of these streams; outside the team's map they withdraw earlier ones."""
     given = [] if fused.final else [s for s in sorted(requested) if in_main_island(fold, s)]
     parts = [fold.latest_part(stream) for stream in given]
     found = marginals.main_priors(fold, parts, PRIOR_LANDMARKS, shown) if given else {}
@@ -272,9 +265,7 @@ def trajectories(
 
 
 def _apart(fold: Fold) -> Iterator[str]:
-    """Give the reason why an island's robots are not joined: without landmark names the test that
-    its best attempt failed.
-    """
+    """Describe why islands are not joined: without landmark names the test that failed last."""
     frames = {min(fold.islands[key].graph.streams): key for key in fold.islands}
     for frame in sorted(frames):
         key = frames[frame]

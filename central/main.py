@@ -193,8 +193,8 @@ class CentralShell:
         return tuple(warnings)
 
     def _request_orders(self) -> None:
-        """Query the router for the operator's orders: the command exits at once, perhaps while this
-        process is offline.
+        """Query the router for operators' orders, which may have come while this process was
+        offline.
         """
         now = time.monotonic()
         if now >= self._orders_due:

@@ -46,8 +46,8 @@ class MapPublisher:
     # Maps.
 
     def publish_due(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Fold the closed ticks; publish a map if one is due, or if a robot has begun at an unknown
-        pose, which needs its landmarks. closed_ns: every submap until then has arrived.
+        """Fold the ticks until closed_ns; publish a map if due, or for a robot from an unknown
+        pose.
         """
         self.fold.fold_until(closed_ns)
         withdrawals = self._announce_withdrawals(now_ns)

@@ -328,10 +328,7 @@ class CentralNode:
         return [encoded(message) for message in self.store.messages_of(robot)]
 
     def answer_site(self, request: bytes) -> Iterable[bytes]:
-        """Answer a `FoldRequest` with a saved map of the present set, solved in full.
-
-        Raises NothingToSaveError.
-        """
+        """Answer a `FoldRequest` with a saved map of the present set; raises NothingToSaveError."""
         decoded(request, m.FoldRequest)
         fold = self.maps.fold
         if not self.finished:

@@ -247,9 +247,7 @@ def _judge_former_places(
     former: Mapping[int, int],
     moved: Mapping[int, m.LandmarkChange],
 ) -> Iterator[m.LandmarkChange]:
-    """List the landmarks that are gone, and the unnamed ones that are new beside a former place
-    which may not be empty.
-    """
+    """List the landmarks that are gone, and unnamed ones new beside a former place."""
     at = island.graph.offset[[*former.values()]].astype(np.intp)
     places = [points_of(island, unseen), np.column_stack([island.state[at], island.state[at + 1]])]
     for id_, absence in zip(

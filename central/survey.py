@@ -70,9 +70,7 @@ def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -
 
 
 def survey_warnings(fold: Fold) -> Iterator[str]:
-    """Warn of surveyed landmarks that the map places elsewhere beyond chance, and of saved maps
-    with a survey.
-    """
+    """Warn of surveyed landmarks that contradict the map, and of saved maps with a survey."""
     if not fold.contributions:
         return
     for stream in sorted(s for s in fold.starts if is_map(s) and SURVEYED in fold.starts):

@@ -152,9 +152,7 @@ class TickFold:
             self._fold_again(tick)
 
     def withdraw_robot(self, robot: str) -> None:
-        """Leave out a robot's submaps and the measurements of it, now and in future, as of a team
-        without the robot.
-        """
+        """Leave out a robot's submaps and the measurements of it, now and in future."""
         if robot not in self._ordered:
             self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
 
@@ -388,10 +386,7 @@ class TickFold:
         return fold
 
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
-        """Find the robot that contradicts the rest in a provisional fold, with the reason.
-
-        A trial's result holds until the set has grown by GROWTH.
-        """
+        """Find the robot that contradicts the rest in a provisional fold, again after each GROWTH."""
         if provisional is self.fold or not self.convicts:
             return {}
         if provisional.size >= self._retried:

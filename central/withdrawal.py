@@ -96,9 +96,7 @@ class Conviction:
 def disagreement(
     agreement: Agreement, chance: float = SUSPICION, least: int = FEWEST
 ) -> dict[str, float]:
-    """Return the disagreement of each robot that can be judged; costs of a probability above
-    e^−chance do not count.
-    """
+    """Return each robot's disagreement; costs of a probability above e^−chance do not count."""
     submaps = agreement.submaps
     seen: dict[str, list[tuple[float, float]]] = {}
     for observer, teammate, chi2 in agreement.sightings:

@@ -80,10 +80,7 @@ def has_default_lengths(profile: AssociationProfile) -> bool:
 def profile_for(
     sensor: Sensor, farthest_m: float, profile: AssociationProfile = DEFAULT_PROFILE
 ) -> AssociationProfile:
-    """Scale the lengths of a profile by a sensor's error at the far end of its view.
-
-    The error is √(σ_range² + (σ_bearing r)²) at r = farthest_m.
-    """
+    """Scale the lengths of a profile by √(σ_range² + (σ_bearing r)²) at r = farthest_m."""
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)
     return msgspec.structs.replace(

@@ -125,9 +125,7 @@ def map_name(text: str) -> str:
 
 
 def map_figures(saved: m.SavedMap) -> dict[str, Any]:
-    """Figures of a saved map: provenance, the robots' own errors, and each landmark with its
-    standard deviations, the shared errors taken as zero.
-    """
+    """Figures of a saved map: provenance, own errors, landmarks given the shared errors."""
     numbers = ids(saved.ids, "ids").tolist()
     points = floats(saved.means, "means").reshape(-1, 2).tolist()
     covariance = unpacked(floats(saved.covariance, "covariance"), 2 * len(numbers))

@@ -47,10 +47,7 @@ FAILED_S = 10.0
 
 
 class SpareTime:
-    """The wall-clock time at which the next piece of deferrable work may begin.
-
-    took_s: duration of the last useful piece.
-    """
+    """The time of the next piece of deferrable work; took_s: duration of the last useful one."""
 
     def __init__(self, share: float) -> None:
         self._rest = 1.0 / share - 1.0
@@ -414,10 +411,7 @@ def select_due(requests: Iterable[R], times: RequestTimes[tuple[str, int]]) -> l
 
 
 class MissingMeasurements:
-    """Request missing measurements for one node.
-
-    confirm: called with each measurement of an answer before the node handles it.
-    """
+    """Request missing measurements; confirm: called with each before the node handles it."""
 
     def __init__(
         self, shell: Shell, confirm: Callable[[Measurement], None] = lambda _: None

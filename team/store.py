@@ -117,10 +117,7 @@ class SubmapStore:
             self.verdicts.add(judgement)
 
     def add_map(self, saved: m.SavedMap) -> str | None:
-        """Add a saved map as a stream of one submap; return the reason if refused.
-
-        Its start is unknown, or the origin in the survey's frame.
-        """
+        """Add a saved map as a stream of one submap, with known start in the survey's frame."""
         for other in self.maps.values():
             if other.name != saved.name and {*other.sets} & {*saved.sets}:
                 return (

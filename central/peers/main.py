@@ -24,10 +24,7 @@ from teamslam.team.wire.bus import Bus, Outgoing, Tap
 
 
 class PeerCentre(Peer):
-    """The centre's peer, which folds the set without an estimator.
-
-    No robot waits for it; it may join and leave at any time.
-    """
+    """The centre's peer, which has no estimator and may join and leave at any time."""
 
     def __init__(
         self, central: CentralConfig, robots: Sequence[str], signer: Signs | None = None

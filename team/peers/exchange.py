@@ -118,10 +118,7 @@ def make_answer(
     node: str,
     sign: Callable[[Member], bytes] | None = None,
 ) -> list[m.Members]:
-    """Answer a request in batches, statements first.
-
-    sign: its author's signature of a member; without one a member is left out. None: no keys.
-    """
+    """Answer a request in batches, statements first; with keys (`sign`), signed members only."""
     batches: list[list[Member]] = [[]]
     total = size = 0
     for each in _list_members(replica, request):

@@ -190,8 +190,8 @@ class PeerNode:
         self.last_refused = why
 
     def new_messages(self) -> Iterator[m.Message]:
-        """Yield queued messages for the fold: operators' orders first, since the fold may end with
-        a stream's last member; `Done` last.
+        """Yield queued messages for the fold: orders first, as it may end with a stream's last
+        member.
         """
         statements, self._new_messages = self._new_messages, []
         statements.sort(key=feed_order)

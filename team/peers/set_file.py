@@ -64,10 +64,7 @@ def records_in(content: bytes) -> Iterator[Record]:
 
 
 def _next_record(content: bytes, at: int) -> int | None:
-    """Find the first intact record from `at` on.
-
-    A damaged record of valid length is skipped as a whole, with any forged ones in its payload.
-    """
+    """Find the first intact record from `at` on, behind damaged ones and any forged in these."""
     while at + _HEAD.size <= len(content) and not _is_intact(content, at):
         following = at + _HEAD.size + _HEAD.unpack_from(content, at)[0]
         if not _is_intact(content, following):
