@@ -81,6 +81,7 @@ class CentralShell:
         self._shell = Shell(bus, self.node, "central", stop)
         self._patience_s = patience_s
         self._shell.notes = self._awaited
+        self._shell.believed = self._store_and_filter
         self._shell.refresh_by(self.node.refresh, FRESH_SHARE)
         self._lost: dict[str, Sample] = {}
         """Tokens of lost robots that the node has not received."""
@@ -103,19 +104,7 @@ class CentralShell:
         self._request_orders()
         self._shell.query_end()
         self._restore()
-        self._shell.begin()
-        while self._shell.going:
-            self._shell.query_end()
-            samples = self._shell.receive()
-            self._stored.note(samples)
-            self._shell.take(self._patient(samples))
-            self._shell.take(self._long_lost())
-            self._give_up()
-            self._shell.contain("wanted", lambda: self._missing.look(self.node.requests()))
-            self._shell.contain("wanted", self._gather)
-            self._request_orders()
-            self._shell.report()
-        self._shell.report(last=True)
+        self._shell.run(self._duty)
         self._stored.close()
         final = self.node.final
         if final is None:
@@ -133,6 +122,17 @@ class CentralShell:
             self._shell.take(each.as_sample(now_ns) for each in self._stored.members)
             count, path = len(self._stored.members), self._stored.path
             _LOG.info("%d members of the set are stored in %s", count, path)
+
+    def _store_and_filter(self, samples: Sequence[Sample]) -> list[Sample]:
+        self._stored.note(samples)
+        return self._patient(samples)
+
+    def _duty(self) -> None:
+        self._shell.take(self._long_lost())
+        self._give_up()
+        self._request_orders()
+        self._missing.look(self.node.requests())
+        self._gather()
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
         """Drop the tokens of lost robots that may return within LOST_S."""

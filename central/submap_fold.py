@@ -85,9 +85,7 @@ class SubmapFold:
         self._ticks = TickFold(config)
         self._ticks.convicts = self._ticks.convicts and convicts
         self._filed: dict[Stream, int] = {}
-        self._firsts: dict[Stream, bytes] = {}
         self._judged = 0
-        self._without: set[str] = set()
         self._accused: Mapping[str, str] = {}
         self._apart: Mapping[str, Fold] = {}
         self._sent_priors = SentPriors(PRIOR_LANDMARKS)
@@ -135,23 +133,23 @@ class SubmapFold:
             raise NothingToSaveError("there is no final map with a landmark")
         before = {saved.author: saved for saved in self.store.maps.values()}
         fold, fused = self._final
-        datum = datum_of(self.config, fused, before.values())
-        return save_map(fold, fused, name, before, self._first_submaps(fold), datum)
-
-    def _first_submaps(self, fold: Fold) -> list[bytes]:
-        """Digests of the first submaps of the robots' streams in the team's map."""
-        main = [stream for stream, key in fold.home.items() if key == fold.main_key]
-        streams = {whole_of(stream) for stream in main if not is_map(stream)}
+        main = (stream for stream, key in fold.home.items() if key == fold.main_key)
+        streams = sorted({whole_of(stream) for stream in main if not is_map(stream)})
         if not streams:
             raise NothingToSaveError("no robot has a submap in the final map")
-        return [digest_of(encoded(self.store.chains[stream][0])) for stream in sorted(streams)]
+        firsts = list(map(self._digest_first, streams))
+        datum = datum_of(self.config, fused, before.values())
+        return save_map(fold, fused, name, before, firsts, datum)
+
+    def _digest_first(self, stream: Stream) -> bytes:
+        """Digest the first submap of a stream, which names it in saved maps."""
+        return digest_of(encoded(self.store.chains[stream][0]))
 
     def _file_members(self) -> None:
         """Add the store's new members; folded ticks are folded again."""
         store, ticks = self.store, self._ticks
-        for robot in sorted(store.withdrawals.keys() - self._without):
+        for robot in sorted(store.withdrawals):
             ticks.withdraw_robot(robot)
-            self._without.add(robot)
         if store.judged != self._judged:
             self._judged = store.judged
             ticks.set_verdicts({verdict_of(each) for each in store.verdicts})
@@ -170,8 +168,6 @@ class SubmapFold:
                 sightings = store.sightings(submap)
                 named = (submap, saved) if own.errors and saved else (submap, *sightings)
                 digest = digest_of(*map(encoded, named))
-                if submap.sequence == 0 and store.maps:
-                    self._firsts[stream] = digest_of(encoded(submap))
                 taken = restricted(submap, store.maps.values()) if localises else submap
                 ticks.add_submap(taken, digest, sightings, own)
                 self._filed[stream] = submap.sequence + 1
@@ -208,13 +204,13 @@ class SubmapFold:
             "taken as no surer than that"
             for robot, count in self._ticks.raised.items()
         )
+        streams = [s for s in sorted(self.store.chains) if self.store.maps and not is_map(s)]
+        firsts = {stream: self._digest_first(stream) for stream in streams}
         repeated = (
             f"{robot}'s measurements of this day are in the saved map {saved.name} already, and "
             "count twice: use a map without them, or another day"
             for saved in self.store.maps.values()
-            for robot in sorted(
-                {stream[0] for stream, first in self._firsts.items() if first in saved.sets}
-            )
+            for robot in sorted({s[0] for s, first in firsts.items() if first in saved.sets})
         )
         undecided = [self._ticks.undecided] if self._ticks.undecided else []
         if self._apart:

@@ -386,7 +386,7 @@ class TickFold:
         return fold
 
     def accuse(self, provisional: Fold) -> Mapping[str, str]:
-        """Find the robot that contradicts the rest in a provisional fold, again after each GROWTH."""
+        """Find the robot that contradicts the rest in a provisional fold, after each GROWTH."""
         if provisional is self.fold or not self.convicts:
             return {}
         if provisional.size >= self._retried:

@@ -213,10 +213,8 @@ class Peer:
             figures[f"set_submaps.{robot}"] = float(sum(len(each.complete) for each in shares))
             newest_ns = max((each.newest_ns for each in shares), default=0)
             figures[f"set_newest_s.{robot}"] = newest_ns * 1e-9
-        for node, over in self.peer.carried.items():
-            figures[f"set_over.{node}"] = float(over.members)
-            figures[f"set_over_bytes.{node}"] = float(over.bytes)
-        return figures
+        over = {f"set_over.{node}": float(n) for node, n in self.peer.carried.items()}
+        return figures | over
 
 
 def member_in(out: Outgoing) -> Member:

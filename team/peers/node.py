@@ -3,9 +3,8 @@
 A node publishes a summary, requests the members that it lacks, and answers requests.
 """
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import msgspec
 
@@ -86,19 +85,11 @@ MOST_OPEN = 16_384
 """Most open requests per node."""
 
 
-@dataclass
-class NodeTraffic:
-    """New members and bytes from one node."""
-
-    members: int = 0
-    bytes: int = 0
-
-
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    known: nodes that may have a set. proofs: None: no keys, every node is trusted. unsaved: new
-    members since last cleared.
+    known: nodes that may have a set. carried: new members by node. proofs: None: no keys, every
+    node is trusted. unsaved: new members since last cleared.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
@@ -120,7 +111,7 @@ class PeerNode:
         self._fed: dict[Stream, int] = {}
         self._new_messages: list[m.Message] = []
         self.rebuild = False
-        self.carried: dict[str, NodeTraffic] = defaultdict(NodeTraffic)
+        self.carried: Counter[str] = Counter()
         self.refused = 0
         self.last_refused = ""
         self.stamp_ns = 0
@@ -135,11 +126,9 @@ class PeerNode:
         except RefusedError as error:
             self._refuse(f"{member.key}: {error}")
             return False
-        over = self.carried[carrier]
-        over.bytes += member.size
         if outcome == "known":
             return False
-        over.members += 1
+        self.carried[carrier] += 1
         self._note_arrival(member.message)
         self.unsaved.append(member)
         self.stamp_ns = max(self.stamp_ns, member.message.stamp_ns)
