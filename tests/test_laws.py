@@ -18,7 +18,7 @@ import teamslam.sim.publisher.node
 import teamslam.team.robot.node
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import CentralNode, make_centre
-from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.datasets.utias import write_utias
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import load, with_options

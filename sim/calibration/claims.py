@@ -81,8 +81,6 @@ def _factor(squared: Float[np.ndarray, " n"], dof: int) -> Mapping[str, float]:
 
 
 class _Rows(NamedTuple):
-    """Measurements of known landmarks, in the sensor frame."""
-
     taken: np.ndarray
     ranges: Float[np.ndarray, " n"]
     points: Float[np.ndarray, "n 2"]

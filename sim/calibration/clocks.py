@@ -183,7 +183,7 @@ def _step(
     rate: Float[np.ndarray, "n 2"],
     sensor: Sensor,
 ) -> float:
-    """Further delay [s] of the detections; rate: ∂true/∂τ [m/s]."""
+    """Further delay [s]; rate: ∂true/∂τ [m/s]."""
     ranges = np.maximum(np.hypot(*points.T), 1e-3)
     x, y = points.T
     zero, one = np.zeros(len(x)), np.ones(len(x))

@@ -188,7 +188,7 @@ def rates(windows: Sequence[WindowLooks]) -> Rates | None:
 def _clutter(
     v: Int64[np.ndarray, " L"], n: Int64[np.ndarray, " L"], p: float, g: float, share: float
 ) -> Float[np.ndarray, " L"]:
-    """Probability that each found landmark is clutter; the binomial coefficients cancel."""
+    """Probability of clutter; the binomial coefficients cancel."""
     real = v * np.log(p) + (n - v) * np.log1p(-p) + np.log1p(-min(share, 1.0 - 1e-9))
     false = v * np.log(g) + (n - v) * np.log1p(-g) + np.log(max(share, 1e-9))
     probability: Float[np.ndarray, " L"] = 1.0 / (1.0 + np.exp(np.clip(real - false, -500, 500)))

@@ -36,8 +36,6 @@ from teamslam.team.wire import messages as m
 
 @dataclass(frozen=True)
 class _Track:
-    """Closed window, and mean particle path in its frame."""
-
     closed: ClosedWindow
     stamps_ns: Int64[np.ndarray, " K"]
     path: Float[np.ndarray, "K 3"]

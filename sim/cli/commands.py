@@ -70,14 +70,12 @@ class _Plain(click.Command):
     """Help of a command or group in plain sections; its epilog is an example."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the example."""
         if self.epilog:
             with formatter.section("Example" if "\n" not in self.epilog else "Examples"):
                 for line in self.epilog.splitlines():
                     formatter.write(f"{'':{formatter.current_indent}}{line}\n")
 
     def get_short_help_str(self, limit: int = 0) -> str:
-        """First sentence of the help, whole."""
         first = " ".join((self.help or "").split("\n\n")[0].split())
         return first.removesuffix(".")
 
@@ -145,10 +143,7 @@ class Group(click.Group, _Plain):
 
 
 class _Choice(click.Choice[Any]):
-    """Choice among the values of an enumeration."""
-
     def normalize_choice(self, choice: object, ctx: click.Context | None) -> str:
-        """Word of a value."""
         return str(choice)
 
 

@@ -3,9 +3,8 @@
 import logging
 import time
 import warnings
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from teamslam.sim.cli import options as opt
 from teamslam.sim.cli.commands import (
@@ -23,14 +22,6 @@ if TYPE_CHECKING:
     from teamslam.team.ros2_driver import Ros2Driver
 
 app = Group()
-
-
-class Back(StrEnum):
-    """Topics that a driver publishes back to ROS 2."""
-
-    ALL = "all"
-    TOPICS = "topics"
-    NONE = "none"
 
 
 _LOG = logging.getLogger("teamslam")
@@ -66,12 +57,12 @@ def driver(
         float, rare("Seconds by which landmarks may arrive later than odometry.", "S", least=0.0)
     ] = 0.2,
     answers: Annotated[
-        Back,
+        Literal["all", "topics", "none"],
         option(
             "What is published back to ROS 2: everything, all but the transform map → odom "
             "(another node publishes it), or nothing."
         ),
-    ] = Back.ALL,
+    ] = "all",
 ) -> None:
     """Drive a robot of a live team by its ROS 2 topics, without ROS here; Ctrl-C ends its
     stream.
@@ -98,8 +89,8 @@ def driver(
     if robot not in topics.robots:
         refuse(f"{ros2}: no [robots.{robot}]; it has {', '.join(topics.robots)}")
     live = None
-    if answers is not Back.NONE:
-        live = LiveAnswers(robot, topics.robots[robot], has_tf=answers is Back.ALL)
+    if answers != "none":
+        live = LiveAnswers(robot, topics.robots[robot], has_tf=answers == "all")
     pose = () if start is None else opt.parse_start(start)[1]
     variances = [pose[3] ** 2, pose[3] ** 2, pose[4] ** 2] if len(pose) == 5 else None
     with (

@@ -116,7 +116,7 @@ def import_(
 
 
 def import_into(path: Path, folder: Path) -> Path:
-    """Import a bag or log, print a summary, return the folder."""
+    """Import a bag or log; returns the folder."""
     from teamslam.sim.importing.source import Request, import_data
 
     if folder.exists() and any(folder.iterdir()):
@@ -129,7 +129,7 @@ def import_into(path: Path, folder: Path) -> Path:
 
 @contextmanager
 def readable(path: Path) -> Iterator[Path]:
-    """Yield a ROS 2 bag as a temporary data set; other paths unchanged."""
+    """Yield a ROS 2 bag as a temporary data set; other paths as they are."""
     from tempfile import TemporaryDirectory
 
     from teamslam.sim.importing.source import Request, import_data, is_ros2_bag
@@ -148,7 +148,6 @@ def readable(path: Path) -> Iterator[Path]:
 
 
 def _as_read(folder: Path) -> list[str]:
-    """Measurements of each robot, and notes on unusable rows."""
     from teamslam.central.desk.evaluation.clocks import separate_times_warning
     from teamslam.sim.datasets.tables import DatasetError
     from teamslam.sim.scenarios.source import open_data_set

@@ -1,4 +1,4 @@
-"""Command `teamslam launch`."""
+"""Commands `teamslam launch` and `teamslam localise`."""
 
 from contextlib import nullcontext
 from dataclasses import asdict, replace
@@ -186,8 +186,50 @@ def launch(
             _keep_showing(at.url, log)
 
 
+@app.declare(
+    "teamslam localise --map site.map --dataset my_set\nteamslam localise --map site.map runs/day2"
+)
+def localise(
+    map_: Annotated[Path, option("The saved map, which stays as it is.", "--map", "FILE")],
+    source: Annotated[
+        str | None,
+        argument(
+            "A scenario, or a log or the folder of a run; default: as of launch.", "[SCENARIO|LOG]"
+        ),
+    ] = None,
+    dataset: opt.Dataset = None,
+    robots: opt.Robots = None,
+    seed: opt.Seed = None,
+    speed: opt.SpeedText = "max",
+    output: Annotated[Path | None, output_option("The run's folder.", "DIR")] = None,
+    json_file: opt.JsonFile = None,
+) -> None:
+    """Localise robots in a saved map, without mapping.
+
+    The map is neither changed nor extended: the final map is the saved one, and
+    poses and paths are in its frame. Robots need no start. With a log, its
+    measurements are localised again.
+    """
+    from teamslam.sim.cli.rerun import rerun
+
+    path = None if source is None else Path(source)
+    if path is not None and (path.suffix == ".mcap" or path.is_dir()):
+        rerun(path, map_=[map_], localise=True, seed=seed, output=output, json_file=json_file)
+        return
+    launch(
+        source,
+        dataset,
+        robots,
+        seed,
+        speed,
+        output=output,
+        map_=[map_],
+        localise=True,
+        json_file=json_file,
+    )
+
+
 def _name_of(scenario: Scenario) -> str:
-    """Name of the scenario's data set; empty for a simulated world or a live team."""
     path = getattr(scenario.world, "path", "")
     return data_set_name(Path(path).resolve()) if path else ""
 
@@ -216,7 +258,6 @@ def _keep_showing(url: str, log: Path) -> None:
 
 
 def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
-    """Scenario with the robots of its data set, a note on the others, and the streams."""
     from teamslam.sim.world.config import LiveWorld, SimulatedWorld
 
     if isinstance(scenario.world, SimulatedWorld | LiveWorld):
@@ -297,7 +338,6 @@ def _keep_earlier(log: Path) -> None:
 def _write_report(
     run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
 ) -> None:
-    """Write the report and print its files; an error fails the run."""
     from teamslam.central.desk.report.page import write_report
 
     try:

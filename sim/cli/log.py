@@ -1,10 +1,9 @@
 """Commands `teamslam log`: inspect, check, repair, cut, merge and export."""
 
 from collections.abc import Sequence
-from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import click
 from click.exceptions import Exit
@@ -18,12 +17,14 @@ from teamslam.team.wire.text import one_line
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from teamslam.team.recording.reader import Log
     from teamslam.team.recording.summary import KeySummary
     from teamslam.team.wire.channels import Channel
 
 NewLog = Annotated[Path, output_option("The new log.", "FILE")]
 ChannelNames = Annotated[str | None, option("Channels, as odometry,submap; all without.", "NAMES")]
 
+Form = Literal["csv", "parquet", "tum", "utias", "rosbag2", "g2o", "isam", "pyfg"]
 NOT_FINISHED = "not finished by its recorder"
 app = Group(
     "log",
@@ -31,19 +32,6 @@ app = Group(
     epilog="teamslam log info runs/first\nteamslam log export runs/first -o bag --format rosbag2",
 )
 app.declare("teamslam log repair team.mcap -o whole.mcap")(repair)
-
-
-class Format(StrEnum):
-    """Export format of a log."""
-
-    CSV = "csv"
-    PARQUET = "parquet"
-    TUM = "tum"
-    UTIAS = "utias"
-    ROSBAG2 = "rosbag2"
-    G2O = "g2o"
-    ISAM = "isam"
-    PYFG = "pyfg"
 
 
 @app.declare("teamslam log info runs/first")
@@ -164,19 +152,19 @@ def export(
     log: opt.LogArgument,
     output: Annotated[Path, output_option("A new folder.")],
     form: Annotated[
-        Format,
+        Form,
         option(
             "A table per channel (csv, parquet), the robots' paths (tum), a data set (utias), "
             "a ROS 2 bag of poses, paths and maps (rosbag2), a landmark graph (g2o, isam, pyfg).",
             "--format",
         ),
-    ] = Format.CSV,
+    ] = "csv",
     channels: ChannelNames = None,
 ) -> None:
     """Write a log as tables, its paths for evo, or its measurements as a data set or graph."""
     from teamslam.central.desk.export.rosbag2 import export_rosbag2
     from teamslam.central.desk.export.tum import export_tum
-    from teamslam.sim.recorded.export import FORMATS, export_graph, export_utias
+    from teamslam.sim.recorded.export import export_graph, export_utias
     from teamslam.team.recording.reader import open_log
 
     opened = open_log(log)
@@ -184,33 +172,34 @@ def export(
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         refuse(f"{output} is there and not an empty folder: give a new one")
     opt.warn_of_holes(opened)
-    if form in (Format.UTIAS, Format.TUM, Format.ROSBAG2, *FORMATS):
-        if channels is not None:
-            refuse(f"--channels is for tables: {form} is of all that the format has")
-        if form is Format.TUM or form in FORMATS:
-            is_tum = form is Format.TUM
-            for path in (
-                export_tum(opened, output) if is_tum else export_graph(opened, output, form)
-            ):
-                click.echo(path)
-            return
-        if form is Format.ROSBAG2:
-            for topic, count in sorted(export_rosbag2(opened, output).items()):
-                click.echo(f"{output}: {topic}: {opt.count_noun(count, 'message')}")
-            return
-        for number, robot in enumerate(export_utias(opened, output), 1):
-            click.echo(f"{output / f'Robot{number}_*.dat'}: {robot}")
-        return
+    if form in ("csv", "parquet"):
+        lines = _export_tables(opened, output, chosen, parquet=form == "parquet")
+    elif channels is not None:
+        refuse(f"--channels is for tables: {form} is of all that the format has")
+    elif form == "rosbag2":
+        topics = sorted(export_rosbag2(opened, output).items())
+        lines = [f"{output}: {topic}: {opt.count_noun(n, 'message')}" for topic, n in topics]
+    elif form == "utias":
+        robots = enumerate(export_utias(opened, output), 1)
+        lines = [f"{output / f'Robot{number}_*.dat'}: {robot}" for number, robot in robots]
+    else:
+        paths = export_tum(opened, output) if form == "tum" else export_graph(opened, output, form)
+        lines = [str(path) for path in paths]
+    for line in lines:
+        click.echo(line)
+
+
+def _export_tables(
+    log: "Log", folder: Path, channels: "list[Channel] | None", *, parquet: bool
+) -> list[str]:
     from teamslam.team.recording.tables import CsvTable, ParquetTable, export_tables
 
-    if form is Format.PARQUET and find_spec("pyarrow") is None:
+    if parquet and find_spec("pyarrow") is None:
         refuse(f"--format parquet needs pyarrow: {install_command('parquet')}")
-    table = ParquetTable if form is Format.PARQUET else CsvTable
-    exported = export_tables(opened, output, chosen, table)
-    for path, rows in exported.rows.items():
-        click.echo(f"{path}: {opt.count_noun(rows, 'row')}")
+    exported = export_tables(log, folder, channels, ParquetTable if parquet else CsvTable)
     if exported.unsound:
         click.echo(f"left out: {exported.unsound} unsound messages", err=True)
+    return [f"{path}: {opt.count_noun(rows, 'row')}" for path, rows in exported.rows.items()]
 
 
 def _channels(names: str | None) -> "list[Channel] | None":
@@ -227,9 +216,8 @@ def _channels(names: str | None) -> "list[Channel] | None":
 
 
 def _key_table(keys: "Sequence[KeySummary]", start_ns: int, *, by_key: bool) -> "Table":
-    """Messages, bytes, rates [Hz] and span [s after start_ns] by key, or by channel.
-
-    A channel's rate is the mean over its keys that begin after start_ns.
+    """Rates [Hz] and spans [s after start_ns] by key, or by channel: means over keys that begin
+    after start_ns.
     """
     from rich.table import Table
     from rich.text import Text

@@ -18,7 +18,7 @@ STUDIES = "teamslam.sim.studies"
 SECTIONS: Mapping[str, Mapping[str, str]] = {
     "Run a team": {
         "launch": "launch",
-        "localise": "localise",
+        "localise": "launch",
         "scenarios": "scenarios",
         "simulate": "scenarios",
     },
@@ -57,19 +57,15 @@ MODULES = {name: module for names in SECTIONS.values() for name, module in names
 
 
 class _Team(Group):
-    """The program; a command is imported when it is used."""
-
     @property
     def by_section(self) -> Mapping[str, Iterable[str]]:
-        """Commands by task."""
         return SECTIONS
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names of all commands."""
         return list(MODULES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a command; all of them for an unknown name, so that the closest is found."""
+        """Import a command; all for an unknown name, so that the closest is found."""
         for name in [cmd_name] if cmd_name in MODULES else MODULES:
             if name not in self.commands:
                 self.add_command(_imported(name), name)

@@ -389,7 +389,6 @@ def record(
 
 
 def _join_parts(log: Path) -> list[Path]:
-    """Join the parts of a log; name remaining parts, with the remedy."""
     from teamslam.team.recording.parts import join_parts
 
     parts = join_parts(log)
@@ -411,7 +410,6 @@ def _fail_if_provisional(parts: Sequence[Path], ends: "Sequence[Channel]") -> No
 
 
 def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
-    """Describe the robots that the final maps of a log lack, by each author's last map."""
     from teamslam.team.recording.reader import LogError, open_log
     from teamslam.team.shell import describe_missing
     from teamslam.team.wire.codec import WireError, decoded

@@ -35,7 +35,7 @@ MOST_HOLES = 5
 
 
 def check_folder(path: Path) -> None:
-    """Exit unless the folder can be created and written."""
+    """Refuse a folder that can not be made or written."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if not os.access(path, os.W_OK):
@@ -109,7 +109,7 @@ SpeedText = Annotated[
 
 
 def check_pieces(scenario: Scenario) -> None:
-    """Exit unless the scenario is a data set of one robot with detections."""
+    """Refuse worlds that are no data set of one robot with detections."""
     if not isinstance(scenario.world, UnlabelledWorld | GraphWorld):
         refuse(
             "--pieces cuts the log of a data set of one robot with detections.csv: give it with "
@@ -124,10 +124,7 @@ def connect_bus(
     node: str,
     stop: threading.Event | None = None,
 ) -> "ZenohBus":
-    """Connect to the router; with keys by TLS, with the node's certificate.
-
-    stop: ends the wait for a silent router.
-    """
+    """Connect to the router, with keys by TLS; stop: ends the wait for it."""
     from teamslam.team.wire.zenoh.bus import ZenohBus
 
     own = None if keys is None else own_keys(keys, node, team)
@@ -135,7 +132,7 @@ def connect_bus(
 
 
 def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
-    """Checked certificate and key of the node; warns of near expiry."""
+    """Checked credentials of a node; warns of near expiry."""
     from teamslam.team.keys.credentials import credentials_of
 
     own = credentials_of(folder, node, team)
@@ -145,12 +142,12 @@ def own_keys(folder: Path, node: str, team: str | None = None) -> "Credentials":
 
 
 def over_tls(endpoint: str) -> str:
-    """Endpoint over TLS if it is a default one; others unchanged."""
+    """Endpoint over TLS if it is a default one."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint in (LOOPBACK, ANY_PORT) else endpoint
 
 
 def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint is local by its address."""
+    """Whether an endpoint is local."""
     protocol, _, address = endpoint.partition("/")
     if protocol.startswith("unix"):
         return True
@@ -162,7 +159,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
-    """Exit if strangers could reach a router that admits everyone."""
+    """Refuse a router that admits every stranger."""
     if "/" not in listen:
         refuse(f"can not listen at {listen}: not an endpoint, as tcp/HOST:PORT")
     if not (keys or insecure or is_loopback(listen)):
@@ -173,7 +170,7 @@ def refuse_open_door(listen: str, *, keys: bool, insecure: bool) -> None:
 
 
 def write_json(path: Path | None, figures: object) -> None:
-    """Write a command's figures to its --json file, if given."""
+    """Write figures to a --json file, if given."""
     if path is None:
         return
     is_device = path.exists() and not path.is_file()  # such as /dev/stdout
@@ -184,20 +181,20 @@ def write_json(path: Path | None, figures: object) -> None:
 
 
 def refuse_existing(path: Path) -> None:
-    """Exit if the file or folder exists."""
+    """Refuse an existing path."""
     if path.exists():
         refuse(f"{path} exists: choose another name or remove it")
 
 
 def warn_of_holes(log: "Log") -> None:
-    """Warn on stderr of messages that the log lacks."""
+    """Warn of messages that the log lacks."""
     from teamslam.team.recording.check import holes
 
     tell_holes(log.path, holes(log))
 
 
 def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
-    """Warn on stderr of these findings in a log."""
+    """Warn of these findings."""
     for finding in found[:MOST_HOLES]:
         click.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:
@@ -206,7 +203,7 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
 
 
 def set_aside(file: Path) -> Path:
-    """Rename a file to the first free number; returns its new path."""
+    """Rename a file to the first free number."""
     number = 1
     while (aside := file.with_name(f"{file.name}.{number}")).exists():
         number += 1
@@ -221,7 +218,7 @@ def count_noun(count: int, what: str) -> str:
 
 
 def parse_speed(text: str) -> float:
-    """Parse a positive multiple of real time; infinite for `max`."""
+    """Multiple of real time; infinite for `max`."""
     if text == "max":
         return math.inf
     try:
@@ -234,7 +231,7 @@ def parse_speed(text: str) -> float:
 
 
 def parse_start(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse `[ROBOT:]x,y,theta[,sigma,sigma]` into robot (may be empty) and numbers."""
+    """Robot (may be empty) and numbers of `[ROBOT:]x,y,theta[,sigma,sigma]`."""
     robot, colon, numbers = text.rpartition(":")
     try:
         pose = tuple(float(part) for part in numbers.split(","))
@@ -260,7 +257,7 @@ def scenario_for(dataset: Path) -> str:
 
 
 def scenario_of(name: str) -> Scenario:
-    """Scenario by name, from a TOML file, or from launch's JSON."""
+    """Scenario by name, TOML file, or launch's JSON."""
     path = Path(name)
     if path.suffix == ".json" and path.is_file():
         try:
@@ -271,7 +268,7 @@ def scenario_of(name: str) -> Scenario:
 
 
 def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
-    """Read saved maps; exit with 2 for an unusable file, or two maps of one name."""
+    """Read saved maps of different names."""
     if not paths:
         return []
     from teamslam.team.saved_map import SavedMapError, read_map  # a log's reader comes with it
@@ -286,13 +283,13 @@ def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
 
 
 def check_joins(scenario: "Scenario", maps: "Sequence[SavedMap]") -> None:
-    """Exit with 2 where maps are given to a fusion rule that joins no submaps."""
+    """Refuse maps for a rule that joins no submaps."""
     if maps and scenario.central.fusion != "join":
         refuse(f"--map: the fusion rule {scenario.central.fusion} joins no saved map")
 
 
 def check_localises(maps: "Sequence[Path] | None", scenario: "Scenario | None" = None) -> None:
-    """Exit with 2 unless robots can be localised: in one map, by a centre."""
+    """Refuse to localise but in one map, by a centre."""
     if len(maps or ()) != 1:
         refuse("--localise: give one saved map by --map")
     if scenario is not None and (scenario.peers or not scenario.centre):
@@ -300,7 +297,7 @@ def check_localises(maps: "Sequence[Path] | None", scenario: "Scenario | None" =
 
 
 def check_names(team: str, robot: str | None = None) -> None:
-    """Exit if the name of a team, or of a robot or saved map, is invalid."""
+    """Refuse an invalid name of a team, robot or saved map."""
     from teamslam.team.keys.roster import ROBOT, TEAM
 
     if robot is not None and not ROBOT.fullmatch(robot.removeprefix(MAP)):
@@ -310,7 +307,7 @@ def check_names(team: str, robot: str | None = None) -> None:
 
 
 def signer_of(keys: Path | None, node: str, team: str) -> "Signer | None":
-    """Signer of a node's messages; None without keys."""
+    """Signer of a node; None without keys."""
     from teamslam.team.keys.signing import Signer
 
     return None if keys is None else Signer(own_keys(keys, node, team))

@@ -163,7 +163,6 @@ def report(
 
 
 def _folder_of(log: Path) -> Path:
-    """Folder of a run's report: the run's own, or one beside a log of another name."""
     from teamslam.team.recording.reader import IN_FOLDER
 
     if log.is_dir():

@@ -240,7 +240,6 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
 def _write_run(
     computed: "list[Sample]", evaluation: "Evaluation", folder: Path, console: "Console"
 ) -> None:
-    """Write log and report of a computed run."""
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.report.page import write_report
     from teamslam.central.desk.report.run import run_figures
@@ -295,7 +294,7 @@ def _verify(path: Path, json_file: Path | None) -> None:
 
 
 def _processes() -> int:
-    """Number of processes that recompute a log; where fork is unsafe or absent, one."""
+    """One process where fork is unsafe or absent."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else 1
 
 

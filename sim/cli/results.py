@@ -33,15 +33,15 @@ class Steps:
         self.print_if_due("")
 
     def share(self, done: float) -> None:
-        """Report the completed share of the step, 0 to 1."""
+        """Report the done share, 0 to 1."""
         self.print_if_due(f": {done:.0%}")
 
     def robot(self, name: str) -> None:
-        """Report the robot that the step has reached."""
+        """Report the step's robot."""
         self.print_if_due(f": {name}")
 
     def print_if_due(self, words: str) -> None:
-        """Print the step with this text, if a line is due."""
+        """Print the step if a line is due."""
         now = time.monotonic()
         if now >= self._due:
             self._due = now + PATIENCE_S
@@ -49,7 +49,7 @@ class Steps:
 
 
 def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":
-    """Read a report's contents from a log; proves_ledger: also prove its ledger."""
+    """Contents of a report; proves_ledger: also prove the ledger."""
     from teamslam.central.desk.evaluation.history import history
     from teamslam.central.desk.export.take_home import take_home
     from teamslam.central.desk.ledger import ledger
@@ -73,7 +73,7 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
 
 
 def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
-    """Print a run's tables and notes."""
+    """Print tables and notes."""
     from teamslam.central.desk.report.tables import summary_tables
 
     for table in summary_tables(evaluation):
@@ -83,7 +83,7 @@ def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
 
 
 def print_nis(run: "Run", console: "Console") -> None:
-    """Print the NIS per degree of freedom of every robot, if any."""
+    """Print the NIS per degree of freedom, if any."""
     from teamslam.central.desk.report.run import nis_line
 
     if (line := nis_line(run.history)) is not None:
@@ -91,7 +91,7 @@ def print_nis(run: "Run", console: "Console") -> None:
 
 
 def print_written(paths: Iterable[Path], console: "Console") -> None:
-    """Print the path of the first written file and the names of the others, which are beside it."""
+    """Print the first written path, and the names of the others."""
     written = list(paths)
     others = written[1:]
     for first in written[:1]:

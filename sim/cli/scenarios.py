@@ -38,7 +38,7 @@ def scenarios(
 
 
 def _summary(name: str) -> str:
-    """The first clause of a scenario's opening comment, without parentheses."""
+    """First clause of the opening comment, without parentheses."""
     lines = takewhile(lambda line: line.startswith("#"), builtin_text(name).splitlines())
     comment = " ".join(line.lstrip("# ") for line in lines)
     while comment != (comment := _PARENTHESES.sub("", comment)):
@@ -61,9 +61,9 @@ def simulate(
     separate file).
     """
     from teamslam.sim.datasets.folder_writer import write_folder
-    from teamslam.sim.datasets.utias_writer import beyond_utias, write_utias
+    from teamslam.sim.datasets.utias import beyond_utias, write_utias
+    from teamslam.sim.scenarios.scenario import data_set_scenario, folder_scenario
     from teamslam.sim.scenarios.source import streams_of
-    from teamslam.sim.scenarios.toml import data_set_scenario, folder_scenario
 
     if output.exists() and any(output.iterdir()):
         refuse(f"{output} is not empty: give a new folder")

@@ -125,7 +125,7 @@ def show_on_page(
     *,
     growing: bool,
 ) -> Iterator["Shown"]:
-    """Serve a log, print the addresses, and open the page on request or on a display."""
+    """Serve a log, and open the page on request or on a display."""
     from teamslam.central.desk.view.server import free_port, session
 
     has_sdk = find_spec("foxglove") is not None

@@ -109,7 +109,6 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
 
 def _check_times(rows: Rows) -> None:
-    """Refuse many rows with the time of another row and other values."""
     cells = list(zip(*(c for name, c in rows.table.columns.items() if name != "t_s"), strict=True))
     same = (np.flatnonzero(np.diff(rows.stamps_ns) == 0) + 1).tolist()
     others = [row for row in same if cells[row] != cells[row - 1]]

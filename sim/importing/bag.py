@@ -169,7 +169,7 @@ def _choice(odometry: list[str]) -> str:
 def _candidates(
     topics: list[Topic], tagged: set[str], space: str | None
 ) -> tuple[list[str], list[str], list[str]]:
-    """Odometry (likeliest first), detections and truth in a namespace; None: all."""
+    """Odometry (likeliest first), detections, truth; space None: all."""
     here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
     true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
     odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]

@@ -95,7 +95,6 @@ def import_files(
 def _refuse_second_robot(
     endings: Sequence[str], used: Collection[str], unused: Collection[str]
 ) -> None:
-    """Refuse an unused file with the odometry's name after another prefix."""
     rest = {re.split("[_-]", n, maxsplit=1)[-1] for n in used if n.endswith(tuple(endings))}
     for name in unused:
         prefix, *behind = re.split("[_-]", name, maxsplit=1)
@@ -179,7 +178,6 @@ def _unassigned(rows: CsvTable, table: Table) -> list[str]:
 
 
 def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) -> None:
-    """Refuse an unused column that names several robots."""
     if kind not in (*MEASURED, "truth"):
         return
     for column in _unassigned(rows, table):
@@ -195,7 +193,6 @@ def _refuse_several_robots(kind: str, rows: CsvTable, table: Table, place: str) 
 
 
 def _convert_points(columns: dict[str, list[str]], table: CsvTable) -> dict[str, list[str]]:
-    """Convert points (ahead, left) to range and bearing."""
     if not all(name in columns for name in POINTS):
         return columns
     x, y = (_numbers(columns.pop(name), name, table) for name in POINTS)

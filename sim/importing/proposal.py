@@ -93,8 +93,6 @@ class _Guess(NamedTuple):
 
 
 class _Proposed(NamedTuple):
-    """TOML text of a table, with KIND for its name."""
-
     file: str
     text: str
 
@@ -111,8 +109,8 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops 
     """Propose a TOML map for the files of each robot.
 
     A table that not all robots have alike, with `own` every table, is `[robots.NAME.KIND]`. One
-    file is the truth of one robot. A robot without odometry has the table of the file that it
-    should have. What is missing or not assigned is a comment.
+    file is the truth of one robot. A robot without odometry has the file that it should have. The
+    rest is comments.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
     _drop_shared_truth(robots, found, drops)
@@ -212,7 +210,6 @@ def _drop_shared_truth(
     found: Mapping[str, tuple[dict[str, _Proposed], list[str]]],
     drops: Drops,
 ) -> None:
-    """Replace a truth that several robots would have by a comment."""
     files = {
         robot: tables["truth"].file
         for robot, (tables, _) in found.items()
@@ -227,7 +224,6 @@ def _drop_shared_truth(
 
 
 def _add_odometry(found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]) -> str:
-    """Add the expected odometry of robots that have none; returns comments."""
     comments = ""
     models = {
         robot: tables["odometry"] for robot, (tables, _) in found.items() if "odometry" in tables
@@ -266,11 +262,10 @@ def proposed_kinds(files: Files) -> set[str]:
 
 
 def split_by_robot(files: Files) -> dict[str, Files]:
-    """Files of each robot by the first or last words of their names; empty for fewer than two
-    robots.
+    """Files of each robot by the first or last words of their names; empty for fewer than two.
 
-    A robot has odometry and measurements; beside one, also a name with one of both in a file called
-    as that robot's. Other files with a robot's name are this robot's; the rest is every robot's.
+    A robot has odometry and measurements; beside one, a name with one of both in a file called
+    alike is enough. Other files with a robot's name are its own; the rest is every robot's.
     """
     for position in (0, -1):
         words = {name: _words(name)[position] for name in files}

@@ -40,9 +40,8 @@ from teamslam.sim.importing.proposal import (
 )
 from teamslam.sim.importing.tables import Report, RobotTables
 from teamslam.sim.recorded.streams import measurements_in
-from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.sim.scenarios.scenario import Scenario, folder_scenario
 from teamslam.sim.scenarios.source import open_data_set
-from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.streams import StartPose, WorldStreams
 from teamslam.team.datum import Datum
 from teamslam.team.recording.check import holes
@@ -169,7 +168,6 @@ def _files_by_robot(request: Request) -> dict[str, list[Path]]:
 
 
 def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) -> Report:
-    """Import CSV files; those of "" are of the robots that map or names have."""
     is_given = request.columns is not None and request.columns.exists()
     read = {robot: read_files(of, tum=not is_given) for robot, of in paths.items()}
     columns = None
@@ -199,7 +197,6 @@ def _csv(paths: Mapping[str, Sequence[Path]], request: Request, folder: Path) ->
 def _files_by_map(
     read: Mapping[str, Mapping[str, CsvTable]], columns: ColumnMap, path: Path
 ) -> Mapping[str, Mapping[str, CsvTable]]:
-    """Files by robot; those of "" by the map."""
     if "" not in read:
         for robot in columns.robots:
             if robot not in read:
@@ -226,7 +223,6 @@ def _question(
     request: Request,
     folder: Path,
 ) -> DatasetError:
-    """Error that proposes a map."""
     split, drops = split_by_robot(of_all), drops_by_robot(of_all)
     by_column = dict.fromkeys(drops, of_all)
     proposed = propose_map(split or by_column or robots, drops={} if split else drops)
@@ -344,7 +340,6 @@ def _written(
 
 
 def _refuse_shared_truth(tables: Sequence[RobotTables]) -> None:
-    """Refuse rows of one file that are the true path of two robots."""
     of: dict[tuple[str, tuple[int, ...]], str] = {}
     for each in tables:
         if (truth := each.sources.get("truth")) is None or not len(truth):

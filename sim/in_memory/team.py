@@ -183,8 +183,6 @@ class World(Protocol):
 
 @dataclass
 class _Seat:
-    """A node, its bus, and the link to it."""
-
     node: World | RobotNode | CentralNode
     bus: MemoryBus
     link: Link

@@ -154,8 +154,6 @@ def show_live(title: str) -> Iterator[Callable[[Watch], None]]:
 
 
 class _Lines:
-    """Plain lines: one every LINE_S, every warning once."""
-
     def __init__(self, console: Console) -> None:
         self._console = console
         self._due = 0.0

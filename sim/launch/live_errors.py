@@ -24,12 +24,10 @@ class _Robot:
     team_ns: int = -1
 
     def begin_again(self, *, given_map: bool) -> None:
-        """Discard poses before a change of kind or frame."""
         self.given_map, self.tally = given_map, NeesTally()
         self.errors.forget_poses()
 
     def judge(self) -> None:
-        """Compare poses up to the newest truth."""
         if (found := self.errors.known()) is not None:
             self.tally.take(found.nees, 3)
             self.errors.forget(int(found.stamps_ns[-1]))

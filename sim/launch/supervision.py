@@ -1,7 +1,7 @@
 """Supervise a team's processes: restart dead ones, give up those without progress.
 
-Without recorder or viewer the team continues, and the run fails at its end. A robot given up is
-lost in the final map. Without router, world or centre the run ends; peers need no centre.
+Without recorder or viewer, or with a robot given up, the run continues and fails at its end.
+Without router, world or centre it ends; peers need no centre.
 """
 
 import math

@@ -109,9 +109,8 @@ class WorldNode:
 
     expected: nodes that must be alive first. speed: team seconds per clock second; infinite:
     limited by credit. cache: last measurements of a robot that can be requested again; an older
-    request begins a new incarnation: unknown initial pose, counters from zero. tells_map: publish
-    true landmarks for localisation. batch_s: most team time between checks for messages. peers:
-    robots whose final maps are awaited, until all have the same set.
+    request begins a new incarnation. tells_map: publish true landmarks. batch_s: most team time
+    between checks for messages. peers: robots whose final maps are awaited.
     """
 
     streams: WorldStreams
@@ -294,7 +293,6 @@ class WorldNode:
         return not waiting or clock_s - self._resumed_at >= RESUME_S
 
     def _skip(self) -> list[Outgoing]:
-        """Skip common measurements; return the initial poses for a late centre."""
         starts = []
         for name, source in self._sources.items():
             incarnation = max(
@@ -387,7 +385,6 @@ class WorldNode:
         return self._paced_ns + (clock_s - self._began_at) * self.speed * 1e9
 
     def _without_credit(self, source: Source) -> str | None:
-        """Node that blocks this robot's next measurement."""
         if source.alive and source.published - source.consumed >= CREDIT_MEASUREMENTS:
             return ch.robot_node(source.stream.robot)
         return "recorder" if self.unrecorded >= CREDIT_RECORDER else None

@@ -21,7 +21,7 @@ from teamslam.sim.datasets.factor_graph import (
     place_by_odometry,
     turn_covariance,
 )
-from teamslam.sim.datasets.utias_writer import beyond_utias, write_utias
+from teamslam.sim.datasets.utias import beyond_utias, write_utias
 from teamslam.sim.recorded.chains import (
     BatchReferenceError,
     Chain,
@@ -43,7 +43,6 @@ from teamslam.team.wire.codec import WireError
 FLOOR = np.diag((1e-4, 2e-3, 1e-4)) ** 2
 """Added to a singular covariance of a motion: without slip, or without motion."""
 SINGULAR = 1e-12
-FORMATS = ("g2o", "isam", "pyfg")
 
 
 def export_graph(log: Log, folder: Path, form: str) -> list[Path]:

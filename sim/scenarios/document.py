@@ -43,7 +43,7 @@ Fields = dict[str, Any]
 
 
 def builtin_names() -> tuple[str, ...]:
-    """Names of the installed scenarios."""
+    """Names of installed scenarios."""
     return tuple(sorted(path.stem for path in BUILTIN.glob("*.toml")))
 
 

@@ -4,14 +4,21 @@ Users write TOML (`teamslam.sim.scenarios.document`); processes receive JSON (`d
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from teamslam.central.config import TeamConfig
-from teamslam.sim.scenarios.checks import ScenarioError, check_fields, close, plain_error, types_of
+from teamslam.central.config import CentralConfig, TeamConfig
+from teamslam.sim.scenarios.checks import (
+    TOP_LEVEL,
+    ScenarioError,
+    check_fields,
+    close,
+    plain_error,
+    types_of,
+)
 from teamslam.sim.scenarios.document import (
     MAX_ROBOTS,
     Fields,
@@ -31,6 +38,7 @@ from teamslam.sim.world.config import (
     UnlabelledWorld,
     UtiasWorld,
     World,
+    starts_unknown,
 )
 from teamslam.team.association import AssociationProfile, has_default_lengths, profile_for
 from teamslam.team.config import Estimator, Exchange, FusionRule, RobotConfig
@@ -186,7 +194,6 @@ def _kind_of(path: str, otherwise: str) -> str:
 def _of_folder(
     robots: Sequence[Fields], path: str, count: int | None
 ) -> tuple[list[Fields], tuple[str, ...]]:
-    """Robots of a folder, and all names in it."""
     from teamslam.sim.datasets.folder_files import robots_of
 
     names = robots_of(path)
@@ -197,7 +204,6 @@ def _of_folder(
 
 
 def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
-    """Robots that the data set has, else its own by the scenario's."""
     chosen = [robot for robot in robots if robot["id"] in names]
     return chosen or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
 
@@ -367,3 +373,43 @@ def _which(kind: object) -> str:
         f"{', '.join(builtin_names())}) at the top of the file, or a table [world] with kind = "
         f'one of {known}; "live" is for robots with drivers, "folder" for CSV tables'
     )
+
+
+def data_set_scenario(scenario: Scenario) -> str:
+    """Same robots and centre, for the UTIAS set in this text's folder; robots are r1, r2, …"""
+    ids = [f"r{i}" for i in range(1, len(scenario.robots) + 1)]
+    return _text(scenario, ids, {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ()))
+
+
+def folder_scenario(scenario: Scenario) -> str:
+    """Same robots and centre, for the tables in this text's folder."""
+    ids = [robot.id for robot in scenario.robots]
+    unknown = [robot for robot in ids if starts_unknown(scenario.world, robot)]
+    world: dict[str, Any] = {"kind": "folder", "path": "."}
+    return _text(scenario, ids, world | ({"unknown_starts": unknown} if unknown else {}))
+
+
+def _text(scenario: Scenario, ids: Sequence[str], world: Mapping[str, Any]) -> str:
+    import tomli_w  # no process of a team writes such a text
+
+    head = {name: getattr(scenario, name) for name in ("name", *TOP_LEVEL, "exchange")}
+    robots = [
+        {"id": name} | _chosen(robot, RobotConfig, ("id", *TOP_LEVEL))
+        for name, robot in zip(ids, scenario.robots, strict=True)
+    ]
+    central = _chosen(scenario.central, CentralConfig, TOP_LEVEL)
+    document = head | {"world": world} | ({"central": central} if central else {})
+    return tomli_w.dumps(document | {"robots": robots})
+
+
+def _chosen(
+    value: msgspec.Struct, declared: type[msgspec.Struct], without: tuple[str, ...]
+) -> dict[str, Any]:
+    chosen: dict[str, Any] = {}
+    for field in msgspec.structs.fields(declared):
+        part = getattr(value, field.name)
+        if field.name in without or part is None or part == field.default:
+            continue
+        table = isinstance(part, msgspec.Struct)
+        chosen[field.name] = _chosen(part, type(part), ()) if table else part
+    return chosen

@@ -100,7 +100,6 @@ def merge(
 
 
 def _plans(study: Study) -> "list[Plan]":
-    """Plans of the experiment, or of all."""
     from teamslam.sim.studies.experiments.experiment import Options
     from teamslam.sim.studies.experiments.runner import dataset, plan_runs
 

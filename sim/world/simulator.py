@@ -97,7 +97,6 @@ def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
 
 
 def _places(world: SimulatedWorld, uniform: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
-    """Points of the square, or of the disc by radius and direction."""
     if world.radius_m is None:
         return uniform * world.size_m
     radius, direction = world.radius_m * uniform[:, 0], 2.0 * np.pi * uniform[:, 1]
@@ -163,7 +162,6 @@ def _random_way_points(
 
 
 def _until_all_stand(world: SimulatedWorld, drives: Sequence[Drive]) -> list[Drive]:
-    """Drives up to the last arrival at a last way-point."""
     if not world.way_point_count:
         return list(drives)
     moving = [np.flatnonzero(drive.steps.any(axis=1)) for drive in drives]
@@ -284,7 +282,6 @@ def _add_claims(
     ],
     seed: int,
 ) -> Detections:
-    """Measurements with individual covariances and matching errors."""
     assert world.landmark_claims is not None
     points = world.landmark_form == "points"
     random = generator(seed, robot.id, "claims")

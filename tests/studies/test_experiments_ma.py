@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.datasets.utias import write_utias
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments import ma, ma_figures

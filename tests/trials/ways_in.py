@@ -37,9 +37,8 @@ import zenoh
 
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.scenarios.scenario import Scenario, folder_scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team.recording.reader import open_log
 from teamslam.team.ros2.bags import opened_bag

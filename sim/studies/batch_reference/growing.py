@@ -1,8 +1,7 @@
-"""Incremental batch MAP over a team's raw measurements, by GTSAM.
+"""Incremental batch MAP over a team's raw measurements (Dellaert & Kaess 2006).
 
-Minimises Σ rᵀP⁻¹r of initial poses and odometry + Σ ρ(rᵀR⁻¹r) of measurements over a pose per robot
-and keyframe and all landmarks (Dellaert & Kaess 2006). ρ: identity, or Cauchy's c² log(1 + χ²/c²).
-R: at the predicted range, not differentiated.
+Minimises Σ rᵀP⁻¹r of initial poses and odometry + Σ ρ(rᵀR⁻¹r) of measurements. ρ: identity, or
+Cauchy's c² log(1 + χ²/c²). R: at the predicted range, not differentiated.
 """
 
 from collections.abc import Mapping, Sequence

@@ -81,7 +81,6 @@ def _started(
     initial: InitialPose,
     *generator: np.random.Generator,
 ) -> S:
-    """The state at an initial pose with its covariance, if any."""
     at = np.zeros(3) if initial.pose is None else initial.pose
     if initial.covariance is None:
         return make(at)
@@ -92,7 +91,6 @@ def _started(
 def _exact(
     make: Callable[[np.ndarray], S], advance: Callable[[S, RobotStep], S]
 ) -> tuple[InitialState, FilterStep]:
-    """Start and step of a filter without random numbers."""
     return (
         lambda config, initial, known, generator: _started(make, advance, initial),
         lambda state, step, generator: advance(state, step),
@@ -100,7 +98,6 @@ def _exact(
 
 
 def _at_pose(make: Callable[[np.ndarray, int], Any]) -> InitialState:
-    """Start of a filter with exact initial poses and particles."""
     return lambda config, initial, known, generator: make(
         np.zeros(3) if initial.pose is None else initial.pose, config.front_end.particles
     )

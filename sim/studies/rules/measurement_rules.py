@@ -67,11 +67,11 @@ class MeasurementCentre(ComparisonCentre):
 
     @abstractmethod
     def _take(self, step: Sequence[RobotKeyframe], turns: Sequence[RobotStep]) -> list[Outgoing]:
-        """Process one step of the team; return poses to publish."""
+        pass
 
     @abstractmethod
     def _content(self, *, final: bool) -> MapContent:
-        """The map of all steps so far."""
+        pass
 
     def file(self, message: m.Message) -> list[Outgoing]:
         """File a measurement, models or the last counters."""

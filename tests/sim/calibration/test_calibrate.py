@@ -21,7 +21,7 @@ from teamslam.sim.calibration.motion import fit_motion
 from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
 from teamslam.sim.calibration.sensor import fit_sensor
-from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.datasets.utias import write_utias
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.streams import (

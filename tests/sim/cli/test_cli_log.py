@@ -6,7 +6,7 @@ from click.testing import CliRunner
 from teamslam.sim.cli.commands import WRONG_USE
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.datasets.utias_writer import write_utias
+from teamslam.sim.datasets.utias import write_utias
 from teamslam.team.recording.check import NO_FINAL
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder

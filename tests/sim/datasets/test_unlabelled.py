@@ -8,9 +8,8 @@ from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.unlabelled import unlabelled
-from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.scenario import folder_scenario, load, with_options
 from teamslam.sim.scenarios.source import open_data_set, scenario_beside, streams_of
-from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.sim.world.config import UnlabelledWorld
 from teamslam.sim.world.streams import FIXES, NO_LABEL, OBSERVATIONS, ODOMETRY
 from teamslam.team import translate

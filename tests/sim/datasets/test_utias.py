@@ -10,8 +10,7 @@ import pytest
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.datasets import utias as errata
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.datasets.utias import utias
-from teamslam.sim.datasets.utias_writer import landmark_shift, write_utias
+from teamslam.sim.datasets.utias import landmark_shift, utias, write_utias
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import dumps, load, loads, with_options

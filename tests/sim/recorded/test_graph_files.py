@@ -9,8 +9,8 @@ from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.graph import read_graph, read_pyfg
 from teamslam.sim.in_memory.team import run_team
+from teamslam.sim.scenarios.scenario import folder_scenario
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.scenarios.toml import folder_scenario
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
 from tests.commands import output_of, run
