@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 from teamslam.team.recording.counters import LATEST_NS, Counters
 from teamslam.team.recording.cut import CUT
 from teamslam.team.recording.inventory import MISSING, Inventory
-from teamslam.team.recording.reader import Declared, Log
+from teamslam.team.recording.reader import Log
 from teamslam.team.recording.records import check_index
 from teamslam.team.recording.repair import REPAIRED, read_undamaged
-from teamslam.team.recording.schemas import schema_of
+from teamslam.team.recording.schemas import Declaration, schema_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open
@@ -183,7 +183,7 @@ def _unsound(sample: Sample) -> str | None:
     return None
 
 
-def find_misdeclaration(key: str, of: Declared) -> str | None:
+def find_misdeclaration(key: str, of: Declaration) -> str | None:
     """Return the defect of a key's declaration, or None; later versions may append fields."""
     row = ch.channel_of(key)
     if row is None:

@@ -28,12 +28,14 @@ from teamslam.team.recording.records import (
     read_frames,
     read_index,
 )
+from teamslam.team.recording.schemas import Declaration
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import Channel, row_of
 
 __all__ = ["LARGEST_CHUNK", "DamagedChunkError", "Log", "LogError", "log_file", "open_log"]
 
 IN_FOLDER = "log.mcap"
+NO_SCHEMA = ("", "", b"")
 _MESSAGE = struct.Struct("<HIQQ")
 _OF_MESSAGE = int(Opcode.MESSAGE)
 """Plain number: comparing enum members takes a tenth of the reading time."""
@@ -46,14 +48,6 @@ class Count(NamedTuple):
     bytes: int
 
 
-class Declared(NamedTuple):
-    """Encoding and schema that a log declares for a key; the schema name may be empty."""
-
-    encoding: str
-    schema: str
-    text: bytes
-
-
 @dataclass
 class Channels:
     """Keys and schemas that one file has declared so far; names: of the channels to read; None:
@@ -62,7 +56,7 @@ class Channels:
 
     names: set[str] | None = None
     keys: dict[int, str | None] = field(default_factory=dict)
-    schemas: dict[int, tuple[str, bytes]] = field(default_factory=lambda: {0: ("", b"")})
+    schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=lambda: {0: NO_SCHEMA})
 
 
 @dataclass(frozen=True)
@@ -79,7 +73,7 @@ class Log:
     complete: bool
     metadata: dict[str, str] = field(repr=False)
     files: tuple[LogFile, ...] = field(repr=False)
-    declared: dict[str, Declared] = field(default_factory=dict, repr=False, compare=False)
+    declared: dict[str, Declaration] = field(default_factory=dict, repr=False, compare=False)
     reading: Callable[[float], None] = field(default=lambda _: None, repr=False, compare=False)
 
     def samples(self, channels: Collection[Channel] | None = None) -> Iterator[Sample]:
@@ -137,12 +131,12 @@ class Log:
     def _introduce(self, opcode: int, body: bytes, channels: Channels) -> None:
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(body)))
-            channels.schemas[schema.id] = schema.name, schema.data
+            channels.schemas[schema.id] = schema.name, schema.encoding, schema.data
         elif opcode == Opcode.CHANNEL:
             channel = LogChannel.read(ReadDataStream(BytesIO(body)))
             key = channel.topic.removeprefix(f"team/{self.team}/")
-            schema = channels.schemas.get(channel.schema_id, ("", b""))
-            self.declared[key] = Declared(channel.message_encoding, *schema)
+            schema = channels.schemas.get(channel.schema_id, NO_SCHEMA)
+            self.declared[key] = Declaration(channel.message_encoding, *schema)
             row = None if channels.names is None else row_of(key)
             is_read = channels.names is None or (row is not None and row.name in channels.names)
             channels.keys[channel.id] = key if is_read else None
