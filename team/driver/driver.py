@@ -166,8 +166,8 @@ class Driver:
             self._odometer.judge(step, lasts_ns or 10**9, "odometry", stamp_ns)
             interval = None
             if lasts_ns is not None:
-                head = make.head_of(self.robot, stamp_ns)
-                interval = m.Odometry(**head, duration_ns=lasts_ns, forward=v, yaw_rate=w)
+                call = make.Call(self.robot, stamp_ns, f"odometry of {self.robot}")
+                interval = call.message(m.Odometry, duration_ns=lasts_ns, forward=v, yaw_rate=w)
             self._drive(stamp_ns, interval, step)
 
     def odometry_increment(
@@ -231,8 +231,8 @@ class Driver:
 
         covariances: L × 2 × 2 of (range, bearing); None: the sensor's noise.
         """
-        stamp_ns = make.stamp_of(t, "observe")
-        seen = make.observations(self.robot, stamp_ns, ids, (ranges, bearings), covariances)
+        call = self._call(t, "observe")
+        seen = make.observations(call, ids, (ranges, bearings), covariances)
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
@@ -247,8 +247,8 @@ class Driver:
 
         covariances: L × 2 × 2; None: the sensor's noise of range and bearing.
         """
-        stamp_ns = make.stamp_of(t, "observe_points")
-        seen = make.points(self.robot, stamp_ns, ids, xy, covariances)
+        call = self._call(t, "observe_points")
+        seen = make.points(call, ids, xy, covariances)
         self._judge_ids(np.asarray(ids).reshape(-1))
         self._see(j.OBSERVATIONS, seen)
 
@@ -264,16 +264,16 @@ class Driver:
 
         classes: a row P(its reported class | class c) for each landmark.
         """
-        stamp_ns = make.stamp_of(t, "detect")
-        seen = make.detections(self.robot, stamp_ns, (ranges, bearings), covariances, classes)
+        call = self._call(t, "detect")
+        seen = make.detections(call, (ranges, bearings), covariances, classes)
         self._see(j.OBSERVATIONS, seen)
 
     def sight(
         self, t: float | Decimal, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
     ) -> None:
         """Add inter-robot measurements at t: teammates' names, ranges [m] and bearings [rad]."""
-        stamp_ns = make.stamp_of(t, "sight")
-        seen = make.sightings(self.robot, stamp_ns, teammates, ranges, bearings)
+        call = self._call(t, "sight")
+        seen = make.sightings(call, teammates, ranges, bearings)
         self._see(j.SIGHTINGS, seen)
 
     def fix(
@@ -283,8 +283,8 @@ class Driver:
 
         covariance: 2 × 2 [m²]; None: `gnss.sigma_m` of the robot's configuration.
         """
-        stamp_ns = make.stamp_of(t, "fix")
-        self._see(j.SIGHTINGS, make.fix(self.robot, stamp_ns, (x, y), covariance))
+        call = self._call(t, "fix")
+        self._see(j.SIGHTINGS, make.fix(call, (x, y), covariance))
 
     # State.
 
@@ -485,15 +485,12 @@ class Driver:
     def _increment(
         self, stamp_ns: int, lasts_ns: int, step: Pose, covariance: ArrayLike | None
     ) -> m.Increment:
-        what = f"the covariance of {self.robot} at {1e-9 * stamp_ns:.3f} s"
-        return make.check_sound(
-            m.Increment(
-                **make.head_of(self.robot, stamp_ns),
-                duration_ns=lasts_ns,
-                increment=from_floats(step),
-                covariance=make.square(covariance, what),
-            ),
-            what,
+        call = make.Call(self.robot, stamp_ns, f"the covariance of {self.robot}")
+        return call.message(
+            m.Increment,
+            duration_ns=lasts_ns,
+            increment=from_floats(step),
+            covariance=make.square(covariance, call.what),
         )
 
     def _until(
@@ -556,6 +553,9 @@ class Driver:
                     "after the last odometry: both need one clock"
                 )
             self._message(kind, seen)
+
+    def _call(self, t: float | Decimal, name: str) -> make.Call:
+        return make.Call(self.robot, make.stamp_of(t, name), name)
 
     def _judge_ids(self, ids: np.ndarray) -> None:
         unknown = [] if self._known is None else sorted({int(i) for i in ids} - self._known)

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +40,28 @@ def stamp_of(t: float | Decimal, what: str) -> int:
     return round(seconds * 1e9)
 
 
-def head_of(robot: str, stamp_ns: int) -> dict[str, Any]:
-    """Return the fields of every measurement; ordering sets incarnation and number."""
-    return {"stamp_ns": stamp_ns, "robot": robot, "incarnation": 0, "number": 0}
+class Call(NamedTuple):
+    """A call of the driver: a robot's measurement at a time, and its name in errors."""
+
+    robot: str
+    stamp_ns: int
+    name: str
+
+    @property
+    def what(self) -> str:
+        """The call in words, as `observe at 3.000 s`."""
+        return f"{self.name} at {1e-9 * self.stamp_ns:.3f} s"
+
+    def message(self, kind: type[M], **fields: Any) -> M:
+        """Build a message without numbers, which ordering sets.
+
+        Raises MeasurementError if a receiver would refuse it.
+        """
+        message = kind(stamp_ns=self.stamp_ns, robot=self.robot, incarnation=0, number=0, **fields)
+        why = find_error(message)
+        if why is not None:
+            raise MeasurementError(f"{self.what}: {why.detail}")
+        return message
 
 
 def check_speeds(forward: float, yaw_rate: float, what: str) -> tuple[float, float]:
@@ -59,33 +78,27 @@ def pose_of(pose: Sequence[float], what: str) -> tuple[float, float, float]:
 
 
 def observations(
-    robot: str,
-    stamp_ns: int,
+    call: Call,
     ids: ArrayLike,
     polar: tuple[ArrayLike, ArrayLike],
     covariances: ArrayLike | None,
 ) -> m.Observations:
     """Build a scan of ids below 2³¹ and (ranges [m], bearings [rad]), which are wrapped."""
-    what = f"observe at {1e-9 * stamp_ns:.3f} s"
+    what = call.what
     numbers = _numbers(ids, what)
     far, angles = _polar(polar, what, len(numbers))
-    return check_sound(
-        m.Observations(
-            **head_of(robot, stamp_ns),
-            ids=from_ids(numbers),
-            ranges=from_floats(far),
-            bearings=from_floats(angles),
-            covariances=_polar_blocks(covariances, len(numbers), what),
-        ),
-        what,
+    return call.message(
+        m.Observations,
+        ids=from_ids(numbers),
+        ranges=from_floats(far),
+        bearings=from_floats(angles),
+        covariances=_polar_blocks(covariances, len(numbers), what),
     )
 
 
-def points(
-    robot: str, stamp_ns: int, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None
-) -> m.Points:
+def points(call: Call, ids: ArrayLike, xy: ArrayLike, covariances: ArrayLike | None) -> m.Points:
     """Build a scan of ids below 2³¹ and points (ahead [m], left [m])."""
-    what = f"observe_points at {1e-9 * stamp_ns:.3f} s"
+    what = call.what
     numbers = _numbers(ids, what)
     positions = np.asarray(xy, dtype=np.float64)
     if positions.size != 2 * len(numbers) or (len(numbers) and positions.shape[-1:] != (2,)):
@@ -93,26 +106,22 @@ def points(
             f"{what}: xy has the shape {positions.shape}; one row (ahead [m], left [m]) for each "
             f"of {len(numbers)} seen"
         )
-    return check_sound(
-        m.Points(
-            **head_of(robot, stamp_ns),
-            ids=from_ids(numbers),
-            positions=from_floats(positions.ravel()),
-            covariances=_blocks(covariances, len(numbers), what),
-        ),
-        what,
+    return call.message(
+        m.Points,
+        ids=from_ids(numbers),
+        positions=from_floats(positions.ravel()),
+        covariances=_blocks(covariances, len(numbers), what),
     )
 
 
 def detections(
-    robot: str,
-    stamp_ns: int,
+    call: Call,
     polar: tuple[ArrayLike, ArrayLike],
     covariances: ArrayLike | None,
     classes: ArrayLike | None = None,
 ) -> m.Detections:
     """Build a scan without identities: (ranges [m], bearings [rad]), P(reported | class) each."""
-    what = f"detect at {1e-9 * stamp_ns:.3f} s"
+    what = call.what
     far, angles = _polar(polar, what, np.asarray(polar[0]).size)
     likely = np.empty((len(far), 0)) if classes is None else np.asarray(classes, np.float64)
     if likely.ndim != 2 or len(likely) != len(far) or not (likely > 0.0).all():
@@ -120,23 +129,20 @@ def detections(
             f"{what}: classes has the shape {likely.shape}; one row for each of {len(far)} seen, "
             "with the probability above 0 of its reported class given each class of the team"
         )
-    return check_sound(
-        m.Detections(
-            **head_of(robot, stamp_ns),
-            ranges=from_floats(far),
-            bearings=from_floats(angles),
-            covariances=_polar_blocks(covariances, len(far), what),
-            classes=from_floats(core.log(likely).ravel()),
-        ),
-        what,
+    return call.message(
+        m.Detections,
+        ranges=from_floats(far),
+        bearings=from_floats(angles),
+        covariances=_polar_blocks(covariances, len(far), what),
+        classes=from_floats(core.log(likely).ravel()),
     )
 
 
 def sightings(
-    robot: str, stamp_ns: int, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
+    call: Call, teammates: Iterable[str], ranges: ArrayLike, bearings: ArrayLike
 ) -> m.Sightings:
     """Build inter-robot measurements: teammates' names, ranges [m], bearings [rad]."""
-    what = f"sight at {1e-9 * stamp_ns:.3f} s"
+    what = call.what
     names = tuple(teammates)
     for name in names:
         if not re.fullmatch(NAME, name):
@@ -144,25 +150,20 @@ def sightings(
                 f"{what}: {name!r} is no robot's name: {NAMED}; a string alone is taken letter by "
                 "letter"
             )
-    if robot in names:
-        raise MeasurementError(f"{what}: {robot} can not see itself; name its teammates")
+    if call.robot in names:
+        raise MeasurementError(f"{what}: {call.robot} can not see itself; name its teammates")
     far, angles = _polar((ranges, bearings), what, len(names))
-    return check_sound(
-        m.Sightings(
-            **head_of(robot, stamp_ns),
-            teammates=names,
-            ranges=from_floats(far),
-            bearings=from_floats(angles),
-        ),
-        what,
+    return call.message(
+        m.Sightings,
+        teammates=names,
+        ranges=from_floats(far),
+        bearings=from_floats(angles),
     )
 
 
-def fix(
-    robot: str, stamp_ns: int, position: tuple[float, float], covariance: ArrayLike | None
-) -> m.Fix:
+def fix(call: Call, position: tuple[float, float], covariance: ArrayLike | None) -> m.Fix:
     """Build an absolute position [m], with its covariance (2 × 2) if stated."""
-    what = f"fix at {1e-9 * stamp_ns:.3f} s"
+    what = call.what
     stated = b""
     if covariance is not None:
         P = np.asarray(covariance, dtype=np.float64)
@@ -170,13 +171,10 @@ def fix(
             raise MeasurementError(f"{what}: its covariance is not 2 × 2")
         check_definite(P[np.newaxis], what)
         stated = from_floats([P[0, 0], P[0, 1], P[1, 1]])
-    return check_sound(
-        m.Fix(
-            **head_of(robot, stamp_ns),
-            position=from_floats([_number(x, f"a position of {what}") for x in position]),
-            covariance=stated,
-        ),
-        what,
+    return call.message(
+        m.Fix,
+        position=from_floats([_number(x, f"a position of {what}") for x in position]),
+        covariance=stated,
     )
 
 
@@ -226,14 +224,6 @@ def check_definite(covariances: np.ndarray, what: str) -> None:
             f"{what}: a covariance is symmetric and positive definite, not {each}; leave "
             "covariances out where none are known"
         )
-
-
-def check_sound(message: M, what: str) -> M:
-    """Return the message; raise MeasurementError if a receiver would refuse it."""
-    why = find_error(message)
-    if why is not None:
-        raise MeasurementError(f"{what}: {why.detail}")
-    return message
 
 
 def _number(value: float, what: str) -> float:

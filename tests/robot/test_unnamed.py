@@ -117,10 +117,11 @@ TREES = np.array([[3.0, 1.0], [5.0, -2.0], [8.0, 2.0], [11.0, -1.0]])
 
 def test_a_driver_gives_probabilities_and_a_wrong_shape_is_named():
     given = [[0.9, 0.1], [0.2, 0.8]]
-    seen = measurement_messages.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given)
+    call = measurement_messages.Call("r1", 0, "detect")
+    seen = measurement_messages.detections(call, ([1.0, 2.0], [0.0, 0.1]), None, given)
     assert np.allclose(np.exp(translate.classes_of(seen, 2)), given)
     with pytest.raises(MeasurementError, match="one row for each of 2"):
-        measurement_messages.detections("r1", 0, ([1.0, 2.0], [0.0, 0.1]), None, given[:1])
+        measurement_messages.detections(call, ([1.0, 2.0], [0.0, 0.1]), None, given[:1])
 
 
 def test_a_submaps_landmark_has_the_sum_of_its_detections(tmp_path):

@@ -16,7 +16,7 @@ from teamslam.sim.scenarios.scenario import (
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import former_names
 from teamslam.team.association import AssociationProfile
-from teamslam.team.driver.measurement_messages import MeasurementError, observations
+from teamslam.team.driver.measurement_messages import Call, MeasurementError, observations
 from teamslam.team.pairs import PAIRS
 from tests import build
 from tests.trials.stress_world import StressWorld, write
@@ -291,4 +291,4 @@ def test_a_bearing_s_sigma_in_degrees_is_refused_in_a_scenario(tmp_path, place):
 
 def test_a_bearing_s_variance_in_degrees_is_refused_by_the_driver():
     with pytest.raises(MeasurementError, match=r"2 rad is 115°; if it is in degrees, give 0\.0349"):
-        observations("r1", 10, [7], ([2.0], [0.1]), [[[0.01, 0.0], [0.0, 4.0]]])
+        observations(Call("r1", 10, "observe"), [7], ([2.0], [0.1]), [[[0.01, 0.0], [0.0, 4.0]]])
