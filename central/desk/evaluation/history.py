@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teamslam.central.desk.evaluation.events import MOST, Event, EventDetector
-from teamslam.central.desk.evaluation.log import head_of
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.team.recording.inventory import numbered_in
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -147,7 +147,10 @@ class _Gathering:
 
     def take(self, sample: Sample) -> None:
         self.logged_ns = _extend(self.logged_ns, sample.stamp_ns)
-        if ch.row_of(sample.key) in ch.SENSORS and (head := head_of(sample)) is not None:
+        if (
+            ch.row_of(sample.key) in ch.SENSORS
+            and (head := numbered_in(sample.payload)) is not None
+        ):
             self.published[head.robot, head.incarnation].take(head.number, sample.wall_ns)
             self.measured_ns = _extend(self.measured_ns, sample.stamp_ns)
         self.take_contents(sample)

@@ -9,11 +9,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-import msgspec
-
 from teamslam.central.desk.evaluation.clocks import Timed
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre, as_centre_final
+from teamslam.team.recording.inventory import numbered_in
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, open_printable
@@ -37,27 +36,6 @@ _COLLECTED = frozenset((
     ch.ORDER, ch.START,
 ))  # fmt: skip
 _OF_A_ROBOT = (ch.ROBOT_CONFIG, ch.TRUTH, ch.ROBOT_DONE)
-
-
-class Head(msgspec.Struct, array_like=True, gc=False):
-    """First fields of every measurement."""
-
-    tag: str
-    stamp_ns: int
-    robot: str
-    incarnation: int
-    number: int
-
-
-_HEAD = msgspec.msgpack.Decoder(Head)
-
-
-def head_of(sample: Sample) -> Head | None:
-    """Head of a measurement, or None."""
-    try:
-        return _HEAD.decode(sample.payload)
-    except (msgspec.DecodeError, UnicodeDecodeError):
-        return None
 
 
 @dataclass
@@ -152,7 +130,7 @@ class Collected:
             self.samples[sample.key].append(sample)
 
     def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
-        head = head_of(sample)
+        head = numbered_in(sample.payload)
         if head is None:
             self._refuse(sample)
             return
