@@ -7,7 +7,7 @@ robot's submaps states of the map. The covariance scale is judged beside all acc
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Final, NamedTuple
 
@@ -306,61 +306,45 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     points = points_of(fold.main, named).view(np.complex128)[:, 0].tolist()
     places = dict(zip(named, points, strict=True))
     for robot, chain in sorted({**own, **withdrawn}.items()):
-        gains: list[tuple[float, Contribution]] = []
+        gains: list[tuple[float, Contribution, list[int]]] = []
         wrong = 0
         sole = {id_ for id_ in seen_by.get(robot, ()) if observers[id_] == 1}
         for each in chain:
-            gain = _gain_of_reflection(places, each, sole)
-            if gain is not None:
-                gains.append((gain, each))
+            ids = each.local.ids.tolist()
+            shared = [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
+            if len(shared) >= LEAST_SHARED:
+                z = [places[ids[k]] for k in shared]
+                w = [complex(x, y) for x, y in each.local.landmarks[shared].tolist()]
+                gain = _gain_of_reflection(z, w)
+                gains.append((gain, each, shared))
                 wrong += not gain > 0.0
             if len(chain) - wrong < MIRRORED * len(chain):  # whatever the others' gains are
                 break
         if len(gains) >= LEAST_MIRRORED and len(gains) - wrong >= MIRRORED * len(gains):
-            chi2 = (gain / _variance_of(places, each, sole) for gain, each in gains)
-            evidence = math.fsum(chi2) / len(gains)
+            chi2 = (gain / _variance_of(each, shared) for gain, each, shared in gains)
             yield m.Diagnosis(
                 cause="mirrored",
                 robot=robot,
                 value=(-1.0,),
                 sigma=(0.0,),
-                evidence=evidence,
+                evidence=math.fsum(chi2) / len(gains),
                 remedy=MIRRORED_REMEDY,
             )
 
 
-def _gain_of_reflection(
-    places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
-) -> float | None:
+def _gain_of_reflection(z: Sequence[complex], w: Sequence[complex]) -> float:
     """Squared distance [m²] of a submap's landmarks from the map's by the best rotation, less that
-    by the best reflection.
-
-    places: landmarks x + iy [m] by id. sole: those that the robot alone observes.
+    by the best reflection; z, w: x + iy [m] in the map and in the submap.
     """
-    ids, own = submap.local.ids.tolist(), _shared(places, submap, sole)
-    if len(own) < LEAST_SHARED:
-        return None
-    z = _centred([places[ids[k]] for k in own])
-    w = _centred([complex(x, y) for x, y in submap.local.landmarks[own].tolist()])
-    rotated, reflected = (
-        sum(a * b for a, b in zip(z, each, strict=True)) for each in ([b.conjugate() for b in w], w)
-    )
+    z, w = _centred(z), _centred(w)
+    rotated = sum(a * b.conjugate() for a, b in zip(z, w, strict=True))
+    reflected = sum(a * b for a, b in zip(z, w, strict=True))
     gain = core.hypot(reflected.real, reflected.imag) - core.hypot(rotated.real, rotated.imag)
     return float(2.0 * gain)
 
 
-def _shared(
-    places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
-) -> list[int]:
-    ids = submap.local.ids.tolist()
-    return [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
-
-
-def _variance_of(
-    places: Mapping[int, complex], submap: Contribution, sole: Collection[int]
-) -> float:
-    own = _shared(places, submap, sole)
-    return float(median(submap.factor.landmarks[own][:, [0, 2]].ravel().tolist()))
+def _variance_of(submap: Contribution, shared: Sequence[int]) -> float:
+    return float(median(submap.factor.landmarks[shared][:, [0, 2]].ravel().tolist()))
 
 
 def _centred(points: Sequence[complex]) -> list[complex]:
@@ -477,14 +461,13 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
             values.append(math.hypot(*numbers[:2]))
         else:
             values.append(numbers[0] if numbers else None)
-    subject = (
-        {"landmark": found.landmark}
-        if found.landmark is not None
-        else {"robot": found.robot or None}
-    )
-    more = {"displacement": list(found.value)} if found.cause in (SHARED, CARRIED_OFF) else {}
-    at: dict[str, object] = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
-    at |= {"place": list(found.place)} if found.place else {}
+    is_of_landmark = found.landmark is not None
+    subject = {"landmark": found.landmark} if is_of_landmark else {"robot": found.robot or None}
+    more: dict[str, object] = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
+    if found.place:
+        more["place"] = list(found.place)
+    if found.cause in (SHARED, CARRIED_OFF):
+        more["displacement"] = list(found.value)
     return {
         "cause": found.cause,
         **subject,
@@ -493,6 +476,5 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
         "evidence": found.evidence,
         "remedy": found.remedy,
         "text": describe(found),
-        **at,
         **more,
     }

@@ -15,8 +15,8 @@ from teamslam.team.shell import WAIT_S, MissingMeasurements, Shell, select_due
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
-from teamslam.team.wire.bus import Bus, Outgoing, Sample, opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import Bus, Sample, opened
+from teamslam.team.wire.codec import WireError, encoded
 from teamslam.team.wire.request_times import RequestTimes
 
 _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
@@ -170,10 +170,9 @@ class CentralShell:
             del self._since[node]
             why = f"lost for {self._patience_s:g} s, the centre's --patience"
             _LOG.warning("%s is given up: %s", node, why)
-            order = Outgoing(
-                ch.GIVEN_UP, node, m.GivenUp(stamp_ns=0, node=node, by="central", reason=why)
-            )
-            self._shell.take([self._shell.sample_of(order)])
+            order = m.GivenUp(stamp_ns=0, node=node, by="central", reason=why)
+            key = ch.GIVEN_UP.key(node)
+            self._shell.take([Sample(key, encoded(order), 0, time.time_ns(), 0)])
 
     def _awaited(self) -> tuple[str, ...]:
         now = time.monotonic()

@@ -1,6 +1,6 @@
 """Conversion of associations of unnamed landmarks, and of verdicts, to and from messages."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from itertools import groupby
 
 import numpy as np
@@ -29,7 +29,21 @@ SHOWN = 1 + LAST
 
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
     """Tabulate the unnamed landmarks; every: all members, else the first and last."""
-    entries = sorted(_all_members(landmarks) if every else _summarised_members(landmarks))
+    members: Iterable[tuple[MemberRecord, int]]
+    if every:
+        identities = landmarks.identities()
+        members = (
+            (record_of(stream, sequence, row), identities[row[1]])
+            for stream, sequence, rows in landmarks.log.all_rows()
+            for row in rows.tolist()
+        )
+    else:
+        members = (
+            (each, id_)
+            for id_, found in landmarks.present.items()
+            for each in (found.first, *found.last)
+        )
+    entries = sorted(_make_entry(*each) for each in members)
     table = []
     for (robot, incarnation), group in groupby(entries, key=lambda entry: entry[0][:2]):
         of = list(group)
@@ -50,19 +64,6 @@ def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membersh
 
 Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
 """A member, its identity, the index of its step in STEPS, and the figures of that step."""
-
-
-def _summarised_members(landmarks: Landmarks) -> Iterator[Entry]:
-    for id_, members in landmarks.present.items():
-        for member in (members.first, *members.last):
-            yield _make_entry(member, id_)
-
-
-def _all_members(landmarks: Landmarks) -> Iterator[Entry]:
-    identities = landmarks.identities()
-    for stream, sequence, rows in landmarks.log.all_rows():
-        for row in rows.tolist():
-            yield _make_entry(record_of(stream, sequence, row), identities[row[1]])
 
 
 def _make_entry(member: MemberRecord, id_: int) -> Entry:

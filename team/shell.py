@@ -28,7 +28,7 @@ from teamslam.team.wire.channels import (
     STATUS,
     Channel,
 )
-from teamslam.team.wire.codec import WireError, decoded, encoded
+from teamslam.team.wire.codec import WireError, decoded
 from teamslam.team.wire.messages import (
     FusedMap,
     Liveliness,
@@ -340,10 +340,6 @@ class Shell:
             return "it has not reported what it has"
         missing, keys = sum(self._lacking.values()), list(self._lacking)
         return f"it lacks {missing} messages on {len(keys)} keys, as {keys[0]}"
-
-    def sample_of(self, out: Outgoing) -> Sample:
-        """Convert a message of this node to a received sample."""
-        return Sample(out.key, encoded(out.message), out.message.stamp_ns, time.time_ns(), 0)
 
     def end(self, final: FusedMap | None) -> None:
         """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""

@@ -59,19 +59,23 @@ _ORDERS = m.KeptRequest(stamp_ns=0, channels=tuple(each.name for each in ch.ORDE
 _LOG = logging.getLogger("teamslam")
 
 
-class Alone:
-    """Timer of a peer that leaves once all others have left."""
+class Lasting:
+    """How long a condition has held."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
-    def since(self, now: float, *, alone: bool) -> bool:
-        """Whether the peer has been alone for LINGER_S."""
-        self._since = (self._since or now) if alone else None
-        left = self._since is not None and now - self._since >= LINGER_S
-        if left:
-            _LOG.warning("the team has ended, and nobody is there who has the rest of the set")
-        return left
+    def seconds(self, now: float, *, holds: bool) -> float:
+        """Return the duration until now [s]; −1: the condition does not hold."""
+        self._since = (now if self._since is None else self._since) if holds else None
+        return -1.0 if self._since is None else now - self._since
+
+
+def _is_abandoned(alone: Lasting, peer: Peer) -> bool:
+    left = alone.seconds(time.monotonic(), holds=peer.is_left_alone) >= LINGER_S
+    if left:
+        _LOG.warning("the team has ended, and nobody is there who has the rest of the set")
+    return left
 
 
 class PeerShell(RobotShell):
@@ -101,8 +105,7 @@ class PeerShell(RobotShell):
         self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = SetFile(store)
         self.shell.notes = lambda: self._keeper.warnings
-        self._over_since: float | None = None
-        self._alone = Alone()
+        self._over, self._alone = Lasting(), Lasting()
 
     def run(self) -> None:
         """Run until no other peer needs this one."""
@@ -163,18 +166,11 @@ class PeerShell(RobotShell):
             tap([member.as_sample(now_ns) for member in members])
 
     def _may_leave(self, now: float) -> bool:
-        if self._alone.since(now, alone=self._peer.is_left_alone):
+        if _is_abandoned(self._alone, self._peer):
             return True
-        if self._peer.final is None:
-            self._over_since = None
-            return False
-        known = self._peer.all_concluded
-        if not known and self._peer.world_alive is not False:
-            self._over_since = None
-            return False
-        self._over_since = now if self._over_since is None else self._over_since
         gone = self._peer.world_alive is False
-        return now - self._over_since >= (WORLD_GONE_S if gone else LINGER_S)
+        is_over = self._peer.final is not None and (self._peer.all_concluded or gone)
+        return self._over.seconds(now, holds=is_over) >= (WORLD_GONE_S if gone else LINGER_S)
 
 
 class CentreShell:
@@ -199,7 +195,7 @@ class CentreShell:
         self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = SetFile(store)
         self._shell.notes = lambda: self._keeper.warnings
-        self._alone = Alone()
+        self._alone = Lasting()
 
     def run(self) -> None:
         """Run until all peers have the same final map."""
@@ -219,8 +215,7 @@ class CentreShell:
         self._shell.end(self._peer.final)
 
     def _duty(self) -> None:
-        now = time.monotonic()
-        self._shell.publish(self._peer.tick(now))
+        self._shell.publish(self._peer.tick(time.monotonic()))
         self._keeper.append(self._peer.news_of_set())
-        alone = self._alone.since(time.monotonic(), alone=self._peer.is_left_alone)
-        self._peer.finished = self._peer.all_concluded or alone
+        is_abandoned = _is_abandoned(self._alone, self._peer)
+        self._peer.finished = self._peer.all_concluded or is_abandoned
