@@ -22,6 +22,7 @@ with nothing condensed (but see FULL_UNNAMED).
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 from teamslam.central.checkpoints import Checkpoints
 from teamslam.central.config import CentralConfig
@@ -114,7 +115,10 @@ class TickFold:
         self.convicts = config.withdraw_above is not None
         self._tries = True
         self._ordered: frozenset[str] = frozenset()
-        self._agreed: tuple[Fold, Agreement, Mapping[str, float]] | None = None
+        self.agreement = agreement = lru_cache(maxsize=1)(marginals.joint_cost)
+        self.disagreement = lru_cache(maxsize=1)(
+            lambda fold: disagreement(agreement(fold), least=1)
+        )
         self._accused: Mapping[str, str] = {}
         self._others: dict[frozenset[str], TickFold] = {}
         self.undecided = ""
@@ -248,19 +252,6 @@ class TickFold:
         return after
 
     # The robot that contradicts the rest.
-
-    def agreement(self, fold: Fold) -> Agreement:
-        """Return the agreement of a fold, cached for the last one."""
-        if self._agreed is None or self._agreed[0] is not fold:
-            found = marginals.joint_cost(fold)
-            self._agreed = fold, found, disagreement(found, least=1)
-        return self._agreed[1]
-
-    def disagreement(self, fold: Fold) -> Mapping[str, float]:
-        """Return each robot's disagreement in a fold; cached likewise."""
-        self.agreement(fold)
-        assert self._agreed is not None
-        return self._agreed[2]
 
     def _due_for_retrial(self, tick: int) -> str | None:
         suspended = self._conviction.suspended

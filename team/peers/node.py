@@ -140,17 +140,8 @@ class PeerNode:
 
     def take_sample(self, sample: Sample, carrier: str) -> bool:
         """Take a member's sample; a certificate must be the authority's."""
-        try:
-            member = member_of(sample.key, sample.payload)
-        except (WireError, ValueError) as error:
-            self._refuse(f"{sample.key}: {error}")
-            return False
-        if self.proofs is not None and isinstance(member.message, m.Certificate):
-            why = self.proofs.refusal(member, self.replica)
-            if why is not None:
-                self._refuse(f"{sample.key}: {why}")
-                return False
-        return self.take(member, carrier)
+        member = self._open(sample.key, sample.payload, b"", sample.key, is_carried=False)
+        return member is not None and self.take(member, carrier)
 
     def take_carried(self, carried: m.Members) -> list[Member]:
         """Take members that another node carries; return the new ones."""
@@ -158,21 +149,29 @@ class PeerNode:
         if carried.node not in self.known:
             self._refuse(f"members from {carried.node[:80]}, not in this team")
             return new_messages
-        for key, payload, signature in zip(
-            carried.keys, carried.payloads, carried.signatures, strict=True
-        ):
-            try:
-                member = member_of(key, payload, signature)
-            except (WireError, ValueError) as error:
-                self._refuse(f"{key[:80]} from {carried.node}: {error}")
-                continue
-            proofs = self.proofs
-            why = None if proofs is None else proofs.refusal(member, self.replica)
-            if why is not None:
-                self._refuse(f"{key[:80]} from {carried.node}: {why}")
-            elif self.take(member, carried.node):
+        rows = zip(carried.keys, carried.payloads, carried.signatures, strict=True)
+        for key, payload, signature in rows:
+            where = f"{key[:80]} from {carried.node}"
+            member = self._open(key, payload, signature, where, is_carried=True)
+            if member is not None and self.take(member, carried.node):
                 new_messages.append(member)
         return new_messages
+
+    def _open(
+        self, key: str, payload: bytes, signature: bytes, where: str, *, is_carried: bool
+    ) -> Member | None:
+        try:
+            member = member_of(key, payload, signature)
+        except (WireError, ValueError) as error:
+            self._refuse(f"{where}: {error}")
+            return None
+        is_checked = is_carried or isinstance(member.message, m.Certificate)
+        if self.proofs is None or not is_checked:
+            return member
+        why = self.proofs.refusal(member, self.replica)
+        if why is not None:
+            self._refuse(f"{where}: {why}")
+        return member if why is None else None
 
     def _refuse(self, why: str) -> None:
         self.refused += 1
