@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from teamslam.team.keys.credentials import CA
+from teamslam.team.keys.credentials import CA, read_key
 from teamslam.team.keys.roster import (
     ROSTER,
     KeysError,
@@ -96,11 +96,7 @@ _Authority = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 def _authority(folder: Path, team: str, now: datetime) -> _Authority:
     paths = folder / CA, folder / CA_KEY
     if all(path.exists() for path in paths):
-        certificate = x509.load_pem_x509_certificate(paths[0].read_bytes())
-        key = serialization.load_pem_private_key(paths[1].read_bytes(), password=None)
-        if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise KeysError(f"{paths[1]}: not a key that `teamslam keys` made")
-        return certificate, key
+        return x509.load_pem_x509_certificate(paths[0].read_bytes()), read_key(paths[1])
     if any(path.exists() for path in paths) or (folder / ROSTER).exists():
         raise KeysError(
             f"{folder} has keys but not both {CA} and {CA_KEY}: certificates are made where the "
@@ -108,12 +104,7 @@ def _authority(folder: Path, team: str, now: datetime) -> _Authority:
         )
     key = ec.generate_private_key(ec.SECP256R1())
     name = _name(team, f"authority of team {team}"[:64])
-    certificate = (
-        _builder(name, name, key.public_key(), now, now + timedelta(days=AUTHORITY_DAYS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_usage(certificates=True), critical=True)
-        .sign(key, hashes.SHA256())
-    )
+    certificate = _sign(name, key, name, key, now, now + timedelta(days=AUTHORITY_DAYS))
     _write_pair(folder, "ca", certificate, key)
     return certificate, key
 
@@ -130,55 +121,54 @@ def _issue(
     key = ec.generate_private_key(ec.SECP256R1())
     issuer, issuer_key = authority
     usages = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    builder = _builder(_name(team, name), issuer.subject, key.public_key(), now, ends)
+    further: list[x509.ExtensionType] = [
+        x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key())
+    ]
     if node == "router":
         usages.append(ExtendedKeyUsageOID.SERVER_AUTH)
         names = [_host(host) for host in dict.fromkeys((*LOCAL, *hosts))]
-        builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-    certificate = (
-        builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(_usage(certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
-        .add_extension(
-            x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()),
-            critical=False,
-        )
-        .sign(issuer_key, hashes.SHA256())
-    )
-    return certificate, key
+        further.append(x509.SubjectAlternativeName(names))
+    further.append(x509.ExtendedKeyUsage(usages))
+    subject = _name(team, name)
+    return _sign(subject, key, issuer.subject, issuer_key, now, ends, *further), key
 
 
-def _builder(
+def _sign(
     subject: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
     issuer: x509.Name,
-    key: ec.EllipticCurvePublicKey,
+    issuer_key: ec.EllipticCurvePrivateKey,
     now: datetime,
     ends: datetime,
-) -> x509.CertificateBuilder:
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, ends) - SKEW)
-        .not_valid_after(ends)
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
-    )
-
-
-def _usage(*, certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not certificates,
+    *further: x509.ExtensionType,
+) -> x509.Certificate:
+    is_authority = key is issuer_key
+    usage = x509.KeyUsage(
+        digital_signature=not is_authority,
         content_commitment=False,
         key_encipherment=False,
         data_encipherment=False,
         key_agreement=False,
-        key_cert_sign=certificates,
-        crl_sign=certificates,
+        key_cert_sign=is_authority,
+        crl_sign=is_authority,
         encipher_only=False,
         decipher_only=False,
     )
+    depth = 0 if is_authority else None
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(min(now, ends) - SKEW)
+        .not_valid_after(ends)
+        .add_extension(x509.BasicConstraints(ca=is_authority, path_length=depth), critical=True)
+        .add_extension(usage, critical=True)
+    )
+    for extension in (x509.SubjectKeyIdentifier.from_public_key(key.public_key()), *further):
+        builder = builder.add_extension(extension, critical=False)
+    return builder.sign(issuer_key, hashes.SHA256())
 
 
 def _name(team: str, common: str) -> x509.Name:

@@ -9,6 +9,7 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from teamslam.team.keys.roster import KeysError
@@ -113,6 +114,14 @@ def _check_fit(
             f"{path} is not of the authority in {authority_path}: they are from two folders; "
             "copy both from one"
         ) from None
+
+
+def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
+    """Read a private key that `teamslam keys` made; raises KeysError for another one."""
+    key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise KeysError(f"{path}: not a key that `teamslam keys` made")
+    return key
 
 
 def read_names(certificate: x509.Certificate) -> tuple[str, str]:

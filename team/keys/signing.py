@@ -11,7 +11,7 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from teamslam.team.keys.credentials import Credentials, read_names
+from teamslam.team.keys.credentials import Credentials, read_key, read_names
 from teamslam.team.keys.roster import ROSTER, Issued, KeysError, load_roster
 
 _ALGORITHM = ec.ECDSA(hashes.SHA256())
@@ -24,10 +24,7 @@ class Signer:
     """
 
     def __init__(self, own: Credentials) -> None:
-        key = serialization.load_pem_private_key(own.key.read_bytes(), password=None)
-        if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise KeysError(f"{own.key}: not a key that `teamslam keys` made")
-        self._key = key
+        self._key = read_key(own.key)
         self._team = own.team
         self._authority = x509.load_pem_x509_certificate(own.authority.read_bytes())
         found = x509.load_pem_x509_certificate(own.certificate.read_bytes())
