@@ -206,10 +206,10 @@ class RosPublisher:
 
 
 class LiveAnswers:
-    """Publishes one robot's results to ROS 2 while it drives.
+    """Publishes one robot's results to ROS 2 while it drives; has_tf: also map → odom.
 
     `add_odometry` is called by the reader of the robot's topics, `add_message` by the driver's
-    thread; `publish` runs where the session is. has_tf: also publish the transform map → odom.
+    thread; `publish` runs where the session is.
     """
 
     def __init__(self, robot: str, topics: RobotTopics, *, has_tf: bool = True) -> None:

@@ -265,9 +265,7 @@ class Journal:
         self.cut, self._size = end - at, at
 
     def cut_off(self) -> str:
-        """Remove the bytes behind the last whole record; return a description. A damaged end is
-        copied.
-        """
+        """Remove the bytes behind the last whole record, a damaged end with a copy; describe it."""
         if not self.cut:
             return ""
         said = f"; {self.cut} bytes of a record that was cut off are left out"
@@ -328,10 +326,7 @@ def open_journal(
 
 
 def _why_not_continued(journal: Journal, team: str, start: Start, age_s: float) -> str:
-    """Reason not to continue the stream of an open file; empty: it is continued.
-
-    age_s: of a stream that is too old, else 0.
-    """
+    """Reason not to continue an open file's stream, too old by its age [s]; empty: continue."""
     if journal.delivered:
         return "has ended"
     if age_s:
@@ -350,10 +345,7 @@ def _why_not_continued(journal: Journal, team: str, start: Start, age_s: float) 
 def replace_journal(
     journal: Journal, why: str, latency_ns: int, team: str, start: Start
 ) -> tuple[Journal, str]:
-    """Rename the file of an open journal, and begin an empty one with the next incarnation.
-
-    Returns it with a description. why: the reason, after "its stream".
-    """
+    """Rename an open journal's file, and begin an empty one; return it and a description."""
     journal.close()
     _, aside = _aside(journal.path)
     journal.path.rename(aside)

@@ -53,10 +53,7 @@ class Call(NamedTuple):
         return f"{self.name} at {1e-9 * self.stamp_ns:.3f} s"
 
     def message(self, kind: type[M], **fields: Any) -> M:
-        """Build a message without numbers, which ordering sets.
-
-        Raises MeasurementError if a receiver would refuse it.
-        """
+        """Build a message without numbers; raises MeasurementError if receivers would refuse it."""
         message = kind(stamp_ns=self.stamp_ns, robot=self.robot, incarnation=0, number=0, **fields)
         why = find_error(message)
         if why is not None:

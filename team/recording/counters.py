@@ -37,8 +37,8 @@ class Counters:
     ) -> list[str]:
         """Find defects, one line each.
 
-        part: earlier publications, before a cut, are not missing. numbered: messages have their own
-        numbers. totals: publishers' final counts.
+        part: of a cut, earlier publications are not missing. numbered: messages have numbers of
+        their own. totals: publishers' final counts.
         """
         counters, walls = self._arrays()
         order = np.lexsort((walls, counters))

@@ -131,10 +131,7 @@ def _last_joined(log: LogFile | None) -> int:
 
 
 def _is_of(first: LogFile | None, log: LogFile | None, path: Path) -> bool:
-    """Return whether a part belongs to the first file's log; an empty one may.
-
-    Logs of earlier versions have no LOG_ID: their team and scenario are compared.
-    """
+    """Return whether a part is of the first file's log; earlier versions' logs have no LOG_ID."""
     if first is None or log is None:
         return path.stat().st_size == 0
     same = LOG_ID, "scenario"

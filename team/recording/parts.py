@@ -84,10 +84,7 @@ def _is_over(log: Log, ends: Sequence[Channel]) -> bool:
 
 
 def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recorder, Inventory]:
-    """Open a recorder for the next part; return it with the inventory of the earlier ones.
-
-    Raises `RecorderError`.
-    """
+    """Open a recorder for the next part; return it with the inventory of the earlier ones."""
     parts = _without_leftovers(path)
     earlier = list(parts.opened)
     if earlier and shutil.disk_usage(path.parent).free < ROOM:
@@ -173,10 +170,7 @@ class OwnLog:
             _LOG.error("its own log is not written any more: %s", error)
 
     def lost(self, robot: str) -> list[tuple[int, int, int]]:
-        """Return the missing intervals of a robot's measurements (incarnation, first, last).
-
-        A killed process loses unflushed measurements, which its robot will not request again.
-        """
+        """Return the measurements that a killed process lost (incarnation, first, last)."""
         if self.failed:
             return []
         return [

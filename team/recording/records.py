@@ -89,10 +89,7 @@ def check_index(file: IO[bytes]) -> str | None:
 
 
 def read_frames(file: IO[bytes], path: Path, start: int = len(MCAP0_MAGIC)) -> Iterator[Frame]:
-    """Yield whole records of the file from `start`, up to a truncated one.
-
-    Behind invalid bytes reading continues at the next chunk found.
-    """
+    """Yield whole records of the file from `start`, behind invalid bytes from the next chunk on."""
     size = os.fstat(file.fileno()).st_size
     if start > size:
         raise LogError(path, f"its index claims to start at {start} of {size} bytes", REPAIR)

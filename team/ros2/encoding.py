@@ -63,7 +63,7 @@ def encode(message: Any) -> bytes:
 
 
 def compose(a: Pose, b: Pose) -> Pose:
-    """Compose two poses, a ∘ b: b, given in the frame of a, in the frame of a."""
+    """Compose two poses, a ∘ b."""
     c, s = float(np.cos(a[2])), float(np.sin(a[2]))
     return a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], _wrapped(a[2] + b[2])
 

@@ -185,10 +185,7 @@ _WITH_NODE = {m.Configuration, m.Progress, m.Status, m.Liveliness, m.Fault, m.Se
 
 
 def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
-    """Convert a reply to a sample of the channel of its message.
-
-    Raises `WireError` if the message does not answer this query, or belongs to another robot.
-    """
+    """Convert a reply to a sample of its channel; raises `WireError` for one to another query."""
     if channel is ch.KEPT:
         kept = decoded(payload, m.Kept)
         stored = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)

@@ -72,8 +72,8 @@ class Arrivals(Generic[T]):
     def due(self, now_s: float) -> tuple[int, int | None] | None:
         """Return the interval to request now, if a gap is old enough; end None: everything since.
 
-        A repeated request is for everything since: a reply without the missing numbers shows that
-        they are gone.
+        A repeated request is for everything: a reply without the missing numbers shows that they
+        are gone.
         """
         missing = self.missing
         if missing is None:

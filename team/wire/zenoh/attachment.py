@@ -15,7 +15,7 @@ _WITHOUT_HASH = 24
 
 
 class Attachment(NamedTuple):
-    """Team time [ns], the publisher's wall clock [ns], and its counter of the key."""
+    """Team time [ns]; the publisher's wall clock [ns], and its counter of the key."""
 
     stamp_ns: int
     wall_ns: int

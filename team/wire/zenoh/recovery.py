@@ -2,8 +2,7 @@
 
 Zenoh's advanced subscriber gives some late joiners only a part of the history. The arrivals of each
 publisher are therefore counted (`arrivals`) and compared with its heartbeats, and gaps older than
-half a second are requested. Publishers beyond the bounds are not tracked; a team of 100 robots,
-each restarted 30 times, is within them.
+half a second are requested. A team of 100 robots, each restarted 30 times, is within the bounds.
 """
 
 import struct
