@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from teamslam.central.desk.evaluation.verdicts import pair_of
+from teamslam.central.desk.evaluation.states import pair_of
 from teamslam.central.desk.names import in_order
 from teamslam.team.keys.roster import ROBOT
 from teamslam.team.peers.members import Member, about

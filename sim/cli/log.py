@@ -163,7 +163,7 @@ def export(
 ) -> None:
     """Write a log as tables, its paths for evo, or its measurements as a data set or graph."""
     from teamslam.central.desk.export.rosbag2 import export_rosbag2
-    from teamslam.central.desk.export.tum import export_tum
+    from teamslam.central.desk.export.take_home import export_tum
     from teamslam.sim.recorded.export import export_graph, export_utias
     from teamslam.team.recording.reader import open_log
 

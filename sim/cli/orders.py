@@ -67,7 +67,7 @@ def verdict(
     The page of `teamslam view` shows their names at a click. The verdict is
     recorded and holds until it is withdrawn.
     """
-    from teamslam.central.desk.evaluation.verdicts import contradicting, describe_verdict
+    from teamslam.central.desk.evaluation.states import contradicting, describe_verdict
     from teamslam.central.desk.orders import NoRobotError, WithdrawError, judge, local_landmark
     from teamslam.team.wire.messages import Judgement
 

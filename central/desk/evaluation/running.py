@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.estimation.consistency import chi2_quantile, nees
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, stamps
+from teamslam.team.wire.arrays import floats
 
 KNOWN_FRAMES = {"", START_POSES, SURVEY_FRAME}
 """Frames with truth that no stream's start fixes."""
@@ -145,10 +146,9 @@ class RunningErrors:
 
     def take_truth(self, message: m.Truth) -> None:
         """Add a batch of truth."""
-        poses = floats(message.poses, "poses").astype(np.float64).reshape(-1, 3)
-        times = stamps(message.stamps, "stamps").astype(np.int64)
-        if len(times):
-            self._truth.append(Path(times, poses))
+        batch = Path(*translate.trajectory_of(message))
+        if len(batch.stamps_ns):
+            self._truth.append(batch)
 
     def is_due(self, stamp_ns: int) -> bool:
         """Whether a pose at this time is far enough from the last."""
@@ -193,12 +193,9 @@ class RunningErrors:
         self.last_ns = None
 
     def _path(self, until_ns: int) -> Path:
-        batches: list[Path] = []
-        for batch in self._truth:
-            batches.append(batch)
-            if batch.stamps_ns[-1] > until_ns:
-                break
-        return join_batches(batches)
+        ends = (batch.stamps_ns[-1] > until_ns for batch in self._truth)
+        count = next((k + 1 for k, is_behind in enumerate(ends) if is_behind), None)
+        return join_batches([*islice(self._truth, count)])
 
 
 @dataclass

@@ -72,3 +72,88 @@ def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
         for name, of in states.items()
         if of.state not in {"joined", "alone"} and not name.startswith(MAP)
     )
+
+
+Pair = frozenset[m.LocalLandmark]
+
+
+def pair_of(judgement: m.Judgement) -> Pair:
+    """Unordered pair of the two landmarks."""
+    return frozenset((judgement.first, judgement.second))
+
+
+def name_of(landmark: m.LocalLandmark) -> str:
+    """Format as `r1/1/12/7`: robot, incarnation, submap, local landmark."""
+    return f"{landmark.robot}/{landmark.incarnation}/{landmark.sequence}/{landmark.local}"
+
+
+def describe_verdict(judgement: m.Judgement) -> str:
+    """Verdict as text."""
+    first, second = name_of(judgement.first), name_of(judgement.second)
+    return f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
+
+
+def contradicting(
+    judgement: m.Judgement, others: Collection[m.Judgement]
+) -> tuple[m.Judgement, ...]:
+    """Smallest set of other verdicts that contradicts a verdict; empty if consistent.
+
+    A chain of "same" verdicts, and last the "different" one on its ends.
+    """
+    pair = pair_of(judgement)
+    same = [each for each in others if each.same and pair_of(each) != pair]
+    different = [each for each in others if not each.same]
+    if not judgement.same:
+        same += [each for each in others if each.same and pair_of(each) == pair]
+        return tuple(_chain(judgement.first, judgement.second, same) or ())
+    found = [
+        (*before, *after, each)
+        for each in different
+        for one, two in ((judgement.first, judgement.second), (judgement.second, judgement.first))
+        if (before := _chain(each.first, one, same)) is not None
+        and (after := _chain(two, each.second, same)) is not None
+    ]
+    return min(found, key=len, default=())
+
+
+def _chain(
+    first: m.LocalLandmark, last: m.LocalLandmark, same: Collection[m.Judgement]
+) -> list[m.Judgement] | None:
+    chains: dict[m.LocalLandmark, list[m.Judgement]] = {first: []}
+    reached = [first]
+    for at in reached:  # grows during the loop
+        for each in same:
+            pair = pair_of(each)
+            for other in pair - {at} if at in pair else ():
+                if other not in chains:
+                    chains[other] = [*chains[at], each]
+                    reached.append(other)
+    return chains.get(last)
+
+
+def verdicts_given(log: "Collected") -> tuple[str, ...]:
+    """Describe the verdicts of a log, in order."""
+    keys = [key for key in log.samples if ch.VERDICT.owner(key) is not None]
+    samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
+    given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]
+    final = log.newest(ch.FINAL_MAP, m.FusedMap)
+    rests_on = () if final is None else final.verdicts
+    return tuple(_words(each, rests_on) for each in given)
+
+
+def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
+    judgement = verdict.judgement
+    text = describe_verdict(judgement) + (f": {verdict.reason}" if verdict.reason else "")
+    if verdict.withdrawn:
+        return f"{text} (withdrawn)"
+    holds = any(
+        pair_of(each) == pair_of(judgement) and each.same == judgement.same for each in rests_on
+    )
+    if not holds:
+        return f"{text} (not in the map: withdrawn, or it does not have both)"
+    chain = contradicting(judgement, rests_on)
+    if judgement.same and len(chain) == 1:
+        return f"{text} (without effect: another verdict has them as two)"
+    if len(chain) > 1:
+        return f"{text} (contradicted: {', '.join(map(describe_verdict, chain))}; two they stay)"
+    return text

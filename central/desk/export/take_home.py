@@ -12,9 +12,9 @@ from typing import Any, TypeAlias
 import msgspec
 import numpy as np
 
-from teamslam.central.desk.evaluation.errors import Path
-from teamslam.central.desk.evaluation.results import MapResult
-from teamslam.central.desk.export.tum import seconds, write_tum
+from teamslam.central.desk.evaluation.errors import Path, associate_truth
+from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.evaluation.results import Evaluation, MapResult
 from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.survey import datum_of
@@ -22,6 +22,7 @@ from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.datum import Datum
 from teamslam.team.geodesy import geodetic_from_local
+from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -209,4 +210,55 @@ def write_paths(paths: Mapping[str, SmoothedPath], folder: FilePath) -> list[Fil
                 writer.writerow([seconds(stamp), *pose, *upper])
         write_tum(Path(path.stamps_ns, path.poses), tum)
         written += [table, tum]
+    return written
+
+
+KINDS = ("smoothed", "online")
+
+
+def write_tum(path: Path, file: FilePath) -> None:
+    """Write a planar path in the TUM format of evo: `timestamp tx ty tz qx qy qz qw` [s], [m].
+
+    https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+    """
+    half = 0.5 * path.poses[:, 2]
+    with file.open("w", encoding="ascii", newline="\n") as lines:
+        lines.write("# timestamp tx ty tz qx qy qz qw\n")
+        for stamp, (x, y, _), qz, qw in zip(
+            path.stamps_ns.tolist(), path.poses, np.sin(half), np.cos(half), strict=True
+        ):
+            lines.write(f"{seconds(stamp)} {x:.17g} {y:.17g} 0 0 0 {qz:.17g} {qw:.17g}\n")
+
+
+def seconds(stamp_ns: int) -> str:
+    """Stamp in seconds with nanosecond digits."""
+    whole, rest = divmod(abs(stamp_ns), 10**9)
+    return f"{'-' * (stamp_ns < 0)}{whole}.{rest:09d}"
+
+
+def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePath]:
+    """Write r1.smoothed.tum, r1.online.tum and r1.truth.tum of every robot; return the files.
+
+    r1.smoothed.truth.tum and r1.online.truth.tum hold the true poses at the path's stamps.
+    """
+    written = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, robot in evaluation.robots.items():
+        paths = {"truth": robot.truth}
+        for kind, path in zip(KINDS, (robot.smoothed_path, robot.online_path), strict=True):
+            paths[kind] = path
+            paths[f"{kind}.truth"] = associate_truth(path, robot.truth)[1]
+        for kind, path in paths.items():
+            if len(path.stamps_ns):
+                written.append(folder / f"{name}.{kind}.tum")
+                write_tum(path, written[-1])
+    return written
+
+
+def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
+    """Write every robot's paths; return the files. Raises LogError without a path."""
+    written = write_trajectories(evaluate(log.samples()), folder)
+    if not written:
+        remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"
+        raise LogError(log.path, "no robot's path in it", remedy)
     return written

@@ -10,12 +10,15 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from teamslam.central.desk.export.take_home import write_geojson, write_map, write_paths
-from teamslam.central.desk.export.tum import write_trajectories
+from teamslam.central.desk.export.take_home import (
+    write_geojson,
+    write_map,
+    write_paths,
+    write_trajectories,
+)
 from teamslam.central.desk.names import OUTSIDE, in_order
-from teamslam.central.desk.pictures.run import error_picture, map_picture
+from teamslam.central.desk.pictures.run import consistency_picture, error_picture, map_picture
 from teamslam.central.desk.pictures.style import PAGE, SCREEN, Picture, Style, drawn_in
-from teamslam.central.desk.pictures.time import consistency_picture
 from teamslam.central.desk.report import tables
 from teamslam.central.desk.report.run import Run
 from teamslam.team.recording.provenance import version

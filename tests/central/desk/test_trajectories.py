@@ -15,7 +15,7 @@ import pytest
 
 from teamslam.central.desk.evaluation.errors import Path, trajectory_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.export.tum import write_trajectories, write_tum
+from teamslam.central.desk.export.take_home import write_trajectories, write_tum
 from teamslam.sim.in_memory.team import run_team
 from tests.sim.logs import scenario, streams
 from tests.support import ROOT
