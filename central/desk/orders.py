@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from teamslam.central.desk.evaluation.states import pair_of
+from teamslam.central.desk.evaluation.states import holds
 from teamslam.central.desk.names import in_order
 from teamslam.team.keys.roster import ROBOT
 from teamslam.team.peers.members import Member, about
@@ -32,7 +32,7 @@ class NoRobotError(WithdrawError):
     """The team has no such robot."""
 
 
-class RunningTeam:
+class _RunningTeam:
     """Robots of a running team, and its folding nodes."""
 
     def __init__(self, bus: Bus, *channels: ch.Channel) -> None:
@@ -45,7 +45,6 @@ class RunningTeam:
 
     @property
     def folds(self) -> bool:
-        """Whether a centre or peer of the team folds."""
         return self._has_peer or self._has_map or self.bus.is_alive("central")
 
     def messages(self, patience_s: float) -> Iterator[tuple[ch.Channel, m.Message]]:
@@ -63,13 +62,11 @@ class RunningTeam:
                 yield channel, message
 
     def maps(self, patience_s: float) -> Iterator[m.FusedMap]:
-        """Receive maps for a time [s]."""
-        for _, message in self.messages(patience_s):
-            if isinstance(message, m.FusedMap):
-                yield message
+        found = (message for _, message in self.messages(patience_s))
+        yield from (each for each in found if isinstance(each, m.FusedMap))
 
     def await_robot(self, robot: str | None = None) -> None:
-        """Wait CENTRE_S for a centre or peer and the robot. Raises WithdrawError, NoRobotError."""
+        """Raise WithdrawError or NoRobotError if CENTRE_S ends without centre, peer or robot."""
         until = time.monotonic() + CENTRE_S
         while time.monotonic() < until:
             for _ in self.messages(LOOK_S):
@@ -91,8 +88,7 @@ def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
         from teamslam.team.peers.proofs import sign_order
 
         member = Member(order.key, encoded(order.message), order.message)
-        robot = about(order.message)
-        if robot:
+        if robot := about(order.message):
             bus.publish(Outgoing(ch.ORDER_SIGNATURE, robot, sign_order(signer, member)))
 
 
@@ -100,7 +96,7 @@ def withdraw(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> m.FusedMap:
     """Order a robot's withdrawal and return the first map without it. Raises WithdrawError."""
-    team = RunningTeam(bus)
+    team = _RunningTeam(bus)
     team.await_robot(robot)
     order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)
     publish_order(bus, Outgoing(ch.ORDER, robot, order), signer)
@@ -120,7 +116,7 @@ def give_up(
     """Order the team to go on without a lost robot; return on confirmation. Raises
     WithdrawError.
     """
-    team = RunningTeam(bus, ch.STATUS)
+    team = _RunningTeam(bus, ch.STATUS)
     team.await_robot(robot)
     node = ch.robot_node(robot)
     order = m.GivenUp(stamp_ns=0, node=node, by="operator", reason=reason)
@@ -138,7 +134,7 @@ def give_up(
 
 def end_team(bus: Bus, reason: str, patience_s: float) -> None:
     """Order a live team to end; return on confirmation. Raises WithdrawError."""
-    team = RunningTeam(bus, ch.TEAM_END)
+    team = _RunningTeam(bus, ch.TEAM_END)
     team.await_robot()
     if bus.is_alive("world"):
         raise WithdrawError(
@@ -178,7 +174,7 @@ def judge(
 
     Raises NoRobotError, WithdrawError.
     """
-    team = RunningTeam(bus)
+    team = _RunningTeam(bus)
     robot = judgement.first.robot
     for each in (robot, judgement.second.robot):
         team.await_robot(each)
@@ -188,11 +184,7 @@ def judge(
     )  # fmt: skip
     publish_order(bus, Outgoing(ch.VERDICT, robot, verdict), signer)
     for fused in team.maps(patience_s):
-        holds = any(
-            pair_of(each) == pair_of(judgement) and each.same == judgement.same
-            for each in fused.verdicts
-        )
-        if holds is not withdrawn:
+        if holds(judgement, fused.verdicts) is not withdrawn:
             return fused
         if fused.final:
             raise WithdrawError("the final map was out before the verdict; run the log again")

@@ -27,9 +27,9 @@ class Member:
     status: m.Status | None = None
     clock_s: float | None = None
     drift: float = 0.0
-    _clock: tuple[float, float] | None = field(default=None, repr=False)
-    _first: tuple[float, float] | None = field(default=None, repr=False)
-    _last: tuple[float, float] | None = field(default=None, repr=False)
+    _clock: tuple[float, float] | None = None
+    _first: tuple[float, float] | None = None
+    _last: tuple[float, float] | None = None
 
     def take(self, status: m.Status, wall_ns: int) -> None:
         """Process a status published at the node's wall time."""
@@ -101,11 +101,8 @@ class Presence:
 
     def clocks(self) -> dict[str, float]:
         """Offset [s] of each measuring driver's clock from the team's median."""
-        found = {
-            node: member.clock_s
-            for node, member in self.members.items()
-            if member.alive and member.clock_s is not None
-        }
+        there = {node: each.clock_s for node, each in self.members.items() if each.alive}
+        found = {node: clock_s for node, clock_s in there.items() if clock_s is not None}
         middle = median(found.values()) if found else 0.0
         return {node: clock_s - middle for node, clock_s in found.items()}
 
@@ -118,20 +115,18 @@ class Presence:
             advice.append(
                 "no centre: robots go on mapping, their maps are not joined; start teamslam central"
             )
-        world = self.is_there("world")
-        for robot in [] if world else self.robots:
+        for robot in [] if self.is_there("world") else self.robots:
             advice += self._of_robot(robot)
         clocks = self.clocks()
-        for node, ahead_s in ((node, clocks[node]) for node in in_order(clocks)):
+        for node in in_order(clocks):
+            ahead_s = clocks[node]
             if abs(ahead_s) > APART_S and len(clocks) > 1:
                 way = "ahead of" if ahead_s > 0 else "behind"
                 remedy = _remedy(self.members[node], behind=ahead_s < 0.0)
                 advice.append(f"{node} stamps {abs(ahead_s):.1f} s {way} the others: {remedy}")
-        for node in in_order(self.members):
-            member = self.members[node]
-            if member.alive and member.status is not None:
-                advice += [f"{node}: {warning}" for warning in member.status.warnings]
-        return advice
+        told = ((n, s) for n in in_order(self.members) if (s := self.members[n].status) is not None)
+        alive = ((node, status) for node, status in told if self.is_there(node))
+        return advice + [f"{node}: {each}" for node, status in alive for each in status.warnings]
 
     def _of_robot(self, robot: str) -> list[str]:
         has_driver, head = self.is_there(ch.source_node(robot)), self.heads.get(robot)
@@ -165,9 +160,5 @@ def _remedy(member: Member, *, behind: bool) -> str:
             f"it lags and {way}: its program delivers old measurements; started again, it may go "
             "on after robot.last_time"
         )
-    return (
-        "set its machine's clock (NTP, PTP), or stamp with the clock that the others have; or its "
-        "program lags behind its measurements"
-        if behind
-        else "set its machine's clock (NTP, PTP), or stamp with the clock that the others have"
-    )
+    remedy = "set its machine's clock (NTP, PTP), or stamp with the clock that the others have"
+    return remedy + ("; or its program lags behind its measurements" if behind else "")

@@ -77,19 +77,18 @@ def not_in_the_map(states: Mapping[str, RobotState]) -> tuple[str, ...]:
 Pair = frozenset[m.LocalLandmark]
 
 
-def pair_of(judgement: m.Judgement) -> Pair:
-    """Unordered pair of the two landmarks."""
+def _pair(judgement: m.Judgement) -> Pair:
     return frozenset((judgement.first, judgement.second))
 
 
-def name_of(landmark: m.LocalLandmark) -> str:
+def _name(landmark: m.LocalLandmark) -> str:
     """Format as `r1/1/12/7`: robot, incarnation, submap, local landmark."""
     return f"{landmark.robot}/{landmark.incarnation}/{landmark.sequence}/{landmark.local}"
 
 
 def describe_verdict(judgement: m.Judgement) -> str:
     """Verdict as text."""
-    first, second = name_of(judgement.first), name_of(judgement.second)
+    first, second = _name(judgement.first), _name(judgement.second)
     return f"{first} and {second} are {'one landmark' if judgement.same else 'two landmarks'}"
 
 
@@ -100,11 +99,11 @@ def contradicting(
 
     A chain of "same" verdicts, and last the "different" one on its ends.
     """
-    pair = pair_of(judgement)
-    same = [each for each in others if each.same and pair_of(each) != pair]
+    pair = _pair(judgement)
+    same = [each for each in others if each.same and _pair(each) != pair]
     different = [each for each in others if not each.same]
     if not judgement.same:
-        same += [each for each in others if each.same and pair_of(each) == pair]
+        same += [each for each in others if each.same and _pair(each) == pair]
         return tuple(_chain(judgement.first, judgement.second, same) or ())
     found = [
         (*before, *after, each)
@@ -116,6 +115,11 @@ def contradicting(
     return min(found, key=len, default=())
 
 
+def holds(judgement: m.Judgement, verdicts: Collection[m.Judgement]) -> bool:
+    """Whether an equal verdict is among others."""
+    return any(_pair(x) == _pair(judgement) and x.same == judgement.same for x in verdicts)
+
+
 def _chain(
     first: m.LocalLandmark, last: m.LocalLandmark, same: Collection[m.Judgement]
 ) -> list[m.Judgement] | None:
@@ -123,7 +127,7 @@ def _chain(
     reached = [first]
     for at in reached:  # grows during the loop
         for each in same:
-            pair = pair_of(each)
+            pair = _pair(each)
             for other in pair - {at} if at in pair else ():
                 if other not in chains:
                     chains[other] = [*chains[at], each]
@@ -133,7 +137,7 @@ def _chain(
 
 def verdicts_given(log: "Collected") -> tuple[str, ...]:
     """Describe the verdicts of a log, in order."""
-    keys = [key for key in log.samples if ch.VERDICT.owner(key) is not None]
+    keys = [key for key in log.samples if ch.row_of(key) is ch.VERDICT]
     samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
     given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]
     final = log.newest(ch.FINAL_MAP, m.FusedMap)
@@ -146,10 +150,7 @@ def _words(verdict: m.Verdict, rests_on: Collection[m.Judgement]) -> str:
     text = describe_verdict(judgement) + (f": {verdict.reason}" if verdict.reason else "")
     if verdict.withdrawn:
         return f"{text} (withdrawn)"
-    holds = any(
-        pair_of(each) == pair_of(judgement) and each.same == judgement.same for each in rests_on
-    )
-    if not holds:
+    if not holds(judgement, rests_on):
         return f"{text} (not in the map: withdrawn, or it does not have both)"
     chain = contradicting(judgement, rests_on)
     if judgement.same and len(chain) == 1:

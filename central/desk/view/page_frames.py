@@ -1,17 +1,16 @@
 """Frames for the page: one JSON object per event, in log order.
 
 t: seconds of team time since the first measurement. Poses and errors are rows of numbers, maps and
-particles base64 of little-endian float32 and uint32. Frames, by `k`: hello: team, title, colours,
-live. now: team time of all active robots. pose: rows x, y, heading, xx, xy, yy, heading variance.
+particles base64 of little-endian float32 and uint32. Frames, by `k`: hello: first; live: growing.
+now: team time of all active robots. pose: rows x, y, heading, xx, xy, yy, heading variance.
 outside: whether the robot is outside the team's map; its poses are then not sent. frame: the
-robot's pose frame changes. err: rows of three errors, three 3σ bounds, NEES per degree of freedom.
-truth: rows x, y, heading. truth_map, map, cloud, path (`ends`: of submaps alone): as named; a map's
-`changes` since the saved maps: number of unchanged landmarks, then landmark, state, place in the
-saved map, displacement, its sigma [m], χ², expected observations. align: x, y, theta of the truth's
-frame in another map frame, null while undetermined. sensor: range, field of view and mount. see:
-rows of a measurement: landmark, −1 without identity, or teammate; ahead [m], left [m]. link: a
-submap (to) or a prior (from) `central`. fig: a node's figures. wait: start-up states of a node.
-bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of the log.
+robot's pose frame changes. err: rows of three errors, three 3σ bounds, NEES per dof. truth: rows x,
+y, heading. map: `changes` since the saved maps: number of unchanged landmarks, then landmark,
+state, place in the saved map, displacement, its sigma [m], χ², expected observations. path: `ends`:
+of submaps alone. align: x, y, theta of the truth's frame in another map frame, null while
+undetermined. see: rows of a measurement: landmark, −1 without identity, or teammate; ahead [m],
+left [m]. link: a submap (to) or a prior (from) `central`. fig: a node's figures. wait: start-up
+states of a node. bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of the log.
 """
 
 import base64
@@ -195,10 +194,8 @@ class PageFrames:
             self._newest_ns = max(self._newest_ns, message.stamp_ns)
         timeless = isinstance(message, m.Liveliness | m.Status | m.Configuration)
         at_ns = self._newest_ns if timeless else message.stamp_ns
-        for event in self._detector.take(message, at_ns):
-            self._add_frame(
-                "ev", t=self._t(event.stamp_ns), e=event.kind, n=event.node, x=event.text
-            )
+        for each in self._detector.take(message, at_ns):
+            self._add_frame("ev", t=self._t(each.stamp_ns), e=each.kind, n=each.node, x=each.text)
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         stream = self._streams[message.robot]
@@ -256,14 +253,11 @@ class PageFrames:
             bearings = floats(message.bearings, "bearings")
             ahead_left = np.column_stack([np.cos(bearings), np.sin(bearings)])
             places = floats(message.ranges, "ranges")[:, np.newaxis] * ahead_left
-        names: Sequence[int | str]
-        match message:
-            case m.Sightings():
-                names = message.teammates
-            case m.Detections():
-                names = [-1] * len(places)
-            case _:
-                names = ids(message.ids, "ids").tolist()
+        names: Sequence[int | str] = [-1] * len(places)
+        if isinstance(message, m.Sightings):
+            names = message.teammates
+        elif not isinstance(message, m.Detections):
+            names = ids(message.ids, "ids").tolist()
         due = {name for name in names if at >= stream.seen_ns.get(name, -SEEN_NS) + SEEN_NS}
         stream.seen_ns |= dict.fromkeys(due, at)
         seen = transform_points(stream.mount, places)
@@ -292,27 +286,20 @@ class PageFrames:
         self._align()
         is_true = self._truth.frames.has(message.frame)
         fit = self._truth.landmarks.fit(message) if is_true else None
-        sets = sets_of(message)
         extra: dict[str, object] = {}
-        if sets:
+        if sets := sets_of(message):
             support = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]
             extra = {"n": [count for count, _ in support], "why": [words for _, words in support]}
-        changes = _changes_of(message, landmarks)
-        if changes is not None:
-            extra["changes"] = changes
+        if message.changes:
+            extra["changes"] = _changes_of(message, landmarks)
         self._add_frame(
-            "map",
-            t=self._t(message.stamp_ns),
-            f=self._frame(),
-            ids=_base64(landmarks.ids.astype("<u4")),
-            xy=_base64(landmarks.means.astype("<f4")),
-            c=_base64(landmarks.blocks.astype("<f4")),
-            final=message.final,
-            joint=message.joint,
+            "map", t=self._t(message.stamp_ns), f=self._frame(),
+            ids=_base64(landmarks.ids.astype("<u4")), xy=_base64(landmarks.means.astype("<f4")),
+            c=_base64(landmarks.blocks.astype("<f4")), final=message.final, joint=message.joint,
             rmse=None if fit is None else _short(fit.rmse_m),
             nees=_short(fit.nees_per_dof) if fit and fit.nees_per_dof is not None else None,
             **extra,
-        )
+        )  # fmt: skip
 
     def _frame(self) -> str | None:
         return None if self._map is None else self._map.frame
@@ -339,9 +326,7 @@ class PageFrames:
             self._add_frame("fig", n=message.node, t=self._t(message.stamp_ns), f=figures)
 
 
-def _changes_of(message: m.FusedMap, landmarks: Landmarks) -> dict[str, object] | None:
-    if not message.changes:
-        return None
+def _changes_of(message: m.FusedMap, landmarks: Landmarks) -> dict[str, object]:
     places = dict(zip(landmarks.ids.tolist(), landmarks.means.tolist(), strict=True))
     rows = []
     for each in message.changes:
@@ -369,15 +354,12 @@ def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
     """
     found: dict[int, tuple[set[tuple[str, int, int]], list[str]]] = {}
     for table in fused.memberships:
-        columns = zip(
-            ids(table.sequences, "sequences").tolist(),
-            ids(table.locals, "locals").tolist(),
-            ids(table.identities, "identities").tolist(),
-            table.steps,
-            floats(table.figures, "figures").reshape(-1, 3).tolist(),
-            strict=True,
-        )
-        for sequence, local, identity, step, (llr, rival, sd) in columns:
+        named = (ids(each, "members") for each in (table.sequences, table.locals, table.identities))
+        columns = *(each.tolist() for each in named), table.steps
+        figures = floats(table.figures, "figures").reshape(-1, 3).tolist()
+        for sequence, local, identity, step, (llr, rival, sd) in zip(
+            *columns, figures, strict=True
+        ):
             submaps, words = found.setdefault(identity, (set(), []))
             submaps.add((table.robot, table.incarnation, sequence))
             name = f"{table.robot}/{table.incarnation}/{sequence}/{local}"
