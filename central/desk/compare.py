@@ -29,7 +29,6 @@ MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
 
 
 def _in_the_frame(path: str) -> Callable[[Evaluation], Any]:
-    """Figure of a run that an arbitrary frame makes meaningless."""
     return lambda run: None if run.arbitrary_frame else figure(run, path)
 
 
@@ -87,13 +86,13 @@ def _rows(before: str, columns: Sequence[Column], of: Sequence[object]) -> list[
 
 
 def compare_figures(runs: Mapping[str, Evaluation]) -> dict[str, Any]:
-    """Figures of `compare_rows` by run and name."""
+    """Cells of `compare_rows` by run and name."""
     rows = compare_rows(runs)
     return {name: {row[0]: row[1][k] for row in rows} for k, name in enumerate(runs)}
 
 
 def compare_picture(runs: Mapping[str, Evaluation], path: Path) -> bool:
-    """Draw the errors of every run; False without truth."""
+    """Draw the errors of runs; False without truth."""
     errors = [None if run.map is None else run.map.errors for run in runs.values()]
     paths = [_aligned_m(each) for run in runs.values() for each in run.robots.values()]
     if not any(errors) and np.isnan(paths).all():
@@ -139,7 +138,7 @@ def same_final_map(recorded: Evaluation, changed: Evaluation) -> bool:
 
 
 def largest_move_m(recorded: Evaluation, changed: Evaluation) -> float | None:
-    """Largest distance [m] between a landmark's two positions, if any is common."""
+    """Largest distance [m] between a common landmark's two positions."""
     if recorded.map is None or changed.map is None:
         return None
     _, a, b = np.intersect1d(recorded.map.ids, changed.map.ids, return_indices=True)

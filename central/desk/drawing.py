@@ -39,7 +39,7 @@ def robot_colours(names: Iterable[str]) -> dict[str, str]:
 
 
 def robot_labels(names: Collection[str]) -> dict[str, str]:
-    """Legend entry of each robot, or one for more robots than colours; Matplotlib omits "_"."""
+    """Legend entry of each robot, or one for all; Matplotlib omits "_"."""
     ordered = in_order(names)
     if len(ordered) <= len(ROBOT_COLOURS):
         return {name: name for name in ordered}

@@ -35,7 +35,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Rejected:
-    """A rejected measurement; number: the robot's counter; kind: its message, as `observations`."""
+    """A rejected measurement; kind: its message, as `observations`."""
 
     robot: str
     incarnation: int
@@ -96,7 +96,7 @@ class Ledger:
         return f"{sentence}; {gone:,} of those in submaps are withdrawn with {gone_with}"
 
     def to_json(self) -> dict[str, Any]:
-        """Totals, violations, rejected measurements, and measurements and maps of each submap."""
+        """All entries as objects, submaps with number of measurements and maps."""
         counts = Counter((*of, e.submap) for of, own in self.entries.items() for e in own)
         robots = in_order({robot for robot, _ in self.entries})
         columns = "robot", "incarnation", "sequence"
@@ -116,7 +116,7 @@ class Ledger:
 
 
 def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> Ledger:
-    """Compute the ledger of a log; raises RerunError without a robot's configuration."""
+    """Compute the ledger of a log; raises RerunError."""
     offenders = [
         f"measurement {each.number} of {_name((each.robot, each.incarnation))} is in the log twice "
         "with different contents"

@@ -19,13 +19,13 @@ PACKED = (".zip", ".mcap", ".db3")
 
 
 def data_set_name(path: str | PurePath) -> str:
-    """Name of a data set's folder or file, without suffix."""
+    """Name of a data set without suffix."""
     place = PurePath(path)
     return place.stem if place.suffix in PACKED else place.name
 
 
 def data_set_of(scenario: str) -> str:
-    """Name of the data set in a scenario's JSON text, or empty."""
+    """Data set's name in a scenario's JSON text, or empty."""
     try:
         return data_set_name(json.loads(scenario)["world"]["path"])
     except (ValueError, LookupError, TypeError):
@@ -40,7 +40,7 @@ def in_order(names: Iterable[str]) -> list[str]:
 
 
 def not_joined(reasons: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Unjoined robots in a map's reasons, as `r2, r3`, and the reason."""
+    """Unjoined robots in a map's reasons, as `r2, r3`, and why."""
     for reason in reasons:
         who, apart, why = reason.partition(_NOT_JOINED)
         if apart:

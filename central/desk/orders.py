@@ -48,7 +48,6 @@ class _RunningTeam:
         return self._has_peer or self._has_map or self.bus.is_alive("central")
 
     def messages(self, patience_s: float) -> Iterator[tuple[ch.Channel, m.Message]]:
-        """Receive valid messages for a time [s]."""
         until = time.monotonic() + patience_s
         while time.monotonic() < until:
             for channel, name, message in open_valid(self.bus.receive(LOOK_S)):
@@ -66,7 +65,7 @@ class _RunningTeam:
         yield from (each for each in found if isinstance(each, m.FusedMap))
 
     def await_robot(self, robot: str | None = None) -> None:
-        """Raise WithdrawError or NoRobotError if CENTRE_S ends without centre, peer or robot."""
+        """Raise WithdrawError or NoRobotError after CENTRE_S."""
         until = time.monotonic() + CENTRE_S
         while time.monotonic() < until:
             for _ in self.messages(LOOK_S):
@@ -82,7 +81,7 @@ class _RunningTeam:
 
 
 def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
-    """Publish an order, with its signature for peers if there are keys."""
+    """Publish an order, with keys also its signature."""
     bus.publish(order)
     if signer is not None:
         from teamslam.team.peers.proofs import sign_order
@@ -95,7 +94,7 @@ def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
 def withdraw(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
 ) -> m.FusedMap:
-    """Order a robot's withdrawal and return the first map without it. Raises WithdrawError."""
+    """Order a robot's withdrawal; return the first map without it. Raises WithdrawError."""
     team = _RunningTeam(bus)
     team.await_robot(robot)
     order = m.Withdrawal(stamp_ns=0, robot=robot, by="operator", reason=reason)

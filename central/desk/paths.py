@@ -37,7 +37,7 @@ class SmoothedPath:
 def smoothed_paths(
     found: Recorded, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, SmoothedPath]:
-    """Compute the path of every robot in the final map; progress receives each name."""
+    """Compute the path of every robot in the final map."""
     last: dict[tuple[str, int, int], m.Trajectory] = {}
     for message in found.of(m.Trajectory, ch.TRAJECTORY):
         begin = int(stamps(message.stamps, "stamps")[0])

@@ -35,7 +35,7 @@ class Agreement:
         self._concluded: dict[str, m.Concluded] = {}
 
     def take(self, sample: Sample) -> None:
-        """Process a sample; ignore other channels and invalid samples."""
+        """Process a sample of these channels."""
         if ch.row_of(sample.key) not in OF_AGREEMENT or (sound := try_open(sample)) is None:
             return
         channel, name, message = sound
@@ -76,7 +76,7 @@ class Agreement:
 
     @property
     def largest(self) -> Sample | None:
-        """Final map of most robots; among equal counts, the smaller hash."""
+        """Final map of most robots; of equal counts the smaller hash."""
         votes = Counter(sha for robot in self.needed if (sha := self.of(robot)) is not None)
         for sha, _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
             if (found := self._final_with(sha)) is not None:
@@ -89,7 +89,7 @@ class Agreement:
 
     @property
     def disagreement(self) -> tuple[str, ...]:
-        """Robots whose final map differs from the majority's, as text."""
+        """Robots whose final map is not the majority's, as text."""
         largest = self.largest
         if largest is None:
             return ()
@@ -218,7 +218,7 @@ def _with_message(sample: Sample, key: str, message: m.Message) -> Sample:
 
 
 def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
-    """Yield samples, each followed by its counterpart in a centre's name."""
+    """Yield samples, each followed by its counterpart of a centre."""
     for sample in samples:
         yield sample
         if (counterpart := centre.of(sample)) is not None:

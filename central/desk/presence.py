@@ -100,14 +100,14 @@ class Presence:
         return in_order(found | self.heads.keys())
 
     def clocks(self) -> dict[str, float]:
-        """Offset [s] of each measuring driver's clock from the team's median."""
+        """Offset [s] of each driver's clock from the team's median."""
         there = {node: each.clock_s for node, each in self.members.items() if each.alive}
         found = {node: clock_s for node, clock_s in there.items() if clock_s is not None}
         middle = median(found.values()) if found else 0.0
         return {node: clock_s - middle for node, clock_s in found.items()}
 
     def advice(self) -> list[str]:
-        """Describe nodes that wait for others, with the remedy."""
+        """Describe waiting nodes and remedies."""
         advice = []
         if self.has_ended:
             advice.append("the final map is out: the team has ended")

@@ -25,7 +25,7 @@ UNKNOWN = int(m.NO_LABEL)
 
 @dataclass(frozen=True, kw_only=True)
 class Pairs:
-    """Pairs of labelled detections, and the number of wrong detections."""
+    """Pairs of labelled detections, and wrong detections."""
 
     right: int
     wrong: int
@@ -35,13 +35,13 @@ class Pairs:
 
     @property
     def precision(self) -> float | None:
-        """Share of right pairs among associated pairs."""
+        """right/(right + wrong)."""
         associated = self.right + self.wrong
         return self.right / associated if associated else None
 
     @property
     def recall(self) -> float | None:
-        """Share of associated pairs among pairs of one label."""
+        """right/(right + missed)."""
         real = self.right + self.missed
         return self.right / real if real else None
 
@@ -53,7 +53,7 @@ class Pairs:
 
     @property
     def wrong_percent(self) -> float | None:
-        """Percentage of detections whose label is not their landmark's."""
+        """Percentage of detections of another label than their landmark's."""
         return 100.0 * self.wrong_detections / self.detections if self.detections else None
 
 
@@ -137,7 +137,6 @@ def _labels(log: Collected) -> dict[tuple[str, int, int], int]:
 def _detections(
     log: Collected, labels: Mapping[tuple[str, int, int], int]
 ) -> Iterable[tuple[int, Place | None, tuple[str, int, int]]]:
-    """Label, place (None: in no submap) and window of each detection."""
     seen: set[tuple[str, int, int]] = set()
     for message in log.of_all(ch.ASSOCIATION, m.Association):
         window = (message.robot, message.incarnation, message.sequence)

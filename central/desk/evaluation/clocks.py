@@ -114,7 +114,7 @@ class Late:
 
 
 def clock_cause(robot: str, found: Late) -> m.Diagnosis | None:
-    """Diagnose a significant clock offset, or None."""
+    """Diagnose a significant clock offset."""
     if not found.is_beyond_doubt:
         return None
     return m.Diagnosis(
@@ -140,7 +140,7 @@ def is_refuted(cause: m.Diagnosis, found: Late | None) -> bool:
 
 
 def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | None:
-    """Warn about groups of robots whose spans of measurement times do not overlap."""
+    """Warn about robots whose measurement times do not overlap."""
     groups: list[list[str]] = []
     until_ns = 0
     for robot in sorted(spans_ns, key=lambda each: spans_ns[each]):
@@ -180,7 +180,7 @@ def lateness(timed: Timed, config: RobotConfig) -> Late | None:
     if not timed.ends_ns or not timed.ids:
         return None
     with np.errstate(all="ignore"):
-        pairs = pairs_of(timed, config)
+        pairs = _pairs_of(timed, config)
         if pairs is None:
             return None
         late_ns = 0
@@ -213,7 +213,7 @@ class _DeadReckoning:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Pairs of measurements of one landmark at base points b_i, b_j, and their time stretch."""
+    """Pairs of measurements of one landmark at b_i, b_j."""
 
     path: _DeadReckoning
     t_i: Int64[np.ndarray, " k"]
@@ -223,7 +223,7 @@ class Pairs:
     stretch: Int64[np.ndarray, " k"]
 
     def step(self, late_ns: int) -> tuple[float, float]:
-        """Further delay of the detections [s] and its σ; NaN if undetermined."""
+        """Further delay [s] and its σ; NaN if undetermined."""
         d, turn = self._motion(late_ns)
         q, way = _turn(self.b_i - d, -turn), _turn(d, -turn)
         before, after = (self._again(late_ns + by) for by in (-STEP_NS, STEP_NS))
@@ -246,7 +246,7 @@ class Pairs:
 
     @property
     def gaps(self) -> Float[np.ndarray, " k"]:
-        """Distance of b_j from its place by the odometry, relative to max(range, NEAR_M)."""
+        """Distance of b_j from its place by the odometry/max(range, NEAR_M)."""
         gaps = self.b_j - self._again(0)
         found: Float[np.ndarray, " k"] = np.hypot(*gaps.T) / np.maximum(
             np.hypot(*self.b_j.T), NEAR_M
@@ -262,8 +262,7 @@ class Pairs:
         return _turn(self.b_i - d, -turn)
 
 
-def pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
-    """Pair subsequent measurements of each landmark; None if too few."""
+def _pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
     path = _dead_reckoning(timed, config)
     stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
     order = np.lexsort((stamps, names))
@@ -395,8 +394,8 @@ def _gains(timed: Timed, config: RobotConfig) -> Float[np.ndarray, " n"]:
         return none
     seen = np.array(timed.seen).reshape(-1, 2) * (1.0, -1.0)
     with np.errstate(all="ignore"):
-        own = pairs_of(timed, config)
-        other = pairs_of(replace(timed, seen=array("d", seen.ravel().tolist())), config)
+        own = _pairs_of(timed, config)
+        other = _pairs_of(replace(timed, seen=array("d", seen.ravel().tolist())), config)
         if own is None or other is None:
             return none
         unit = min(float(np.median(each.gaps)) for each in (own, other))

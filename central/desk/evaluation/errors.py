@@ -25,7 +25,7 @@ class Path:
 
 
 def join_batches(batches: Sequence[Path]) -> Path:
-    """Join batches to one path by stamp; the first of equal stamps counts."""
+    """Join batches by stamp; the first of equal stamps counts."""
     if not batches:
         return Path(np.zeros(0, np.int64), np.zeros((0, 3)))
     stamps = np.concatenate([batch.stamps_ns for batch in batches])
@@ -91,7 +91,7 @@ class MapErrors:
 
     @property
     def in_band(self) -> bool:
-        """Whether this run's NEES lies in its band."""
+        """Whether the NEES lies in its band."""
         return self.band[0] <= self.nees_per_dof <= self.band[1]
 
     @property
@@ -129,7 +129,7 @@ def map_errors(
     covariance: Float[np.ndarray, "m m"],
     truth: Float[np.ndarray, "L 2"],
 ) -> MapErrors:
-    """Errors of L ≥ 1 landmarks with joint covariance 2L × 2L."""
+    """Errors of L ≥ 1 landmarks with 2L × 2L covariance."""
     count = len(means)
     difference = means - truth
     motion = rigid_alignment(truth, means)
@@ -186,7 +186,7 @@ def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m 
 def rigid_alignment(
     truth: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "3"] | None:
-    """truth_from_points by least squares without scale (Umeyama 1991); None below two points."""
+    """truth_from_points by least squares (Umeyama 1991); None below two points."""
     if len(points) < NEEDED or np.ptp(points, axis=0).max() == 0.0:
         return None
     return procrustes(truth, points, np.ones(len(points)))
@@ -237,7 +237,7 @@ def interpolate_truth(
 def pose_errors(
     path: Path, covariances: Float[np.ndarray, "K 3 3"], truth: Path
 ) -> PoseErrors | None:
-    """Errors of a path's poses with truth; None without any."""
+    """Errors of the poses with truth; None without any."""
     true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
         return None
@@ -292,14 +292,14 @@ class TrajectoryErrors:
 
 
 def associate_truth(path: Path, truth: Path) -> tuple[Path, Path]:
-    """Poses of the path with truth, and the true poses at these stamps."""
+    """Poses with truth, and the true poses there."""
     poses, known = interpolate_truth(truth, path.stamps_ns)
     stamps = path.stamps_ns[known]
     return Path(stamps, path.poses[known]), Path(stamps, poses[known])
 
 
 def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
-    """Compute the errors of a path; None without truth."""
+    """Errors of a path; None without truth."""
     estimate, true = (each.poses for each in associate_truth(path, truth))
     if not len(estimate):
         return None

@@ -68,7 +68,7 @@ TeamMotion = tuple[Float[np.ndarray, "3"], str]
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
-    """Evaluate one run from its samples in log order."""
+    """Evaluate one run from its samples."""
     log = collect_log(samples)
     world, scenario = log.newest(ch.WORLD_CONFIG, m.Configuration), None
     if world is not None:
@@ -129,7 +129,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         ),
         verdicts=verdicts_given(log),
         data_set="" if world is None else data_set_of(world.configuration),
-        gps_median_m=gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
+        gps_median_m=_gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
         separate_times=separate_times,
         mirrored=mirrored,
         lateness=late,
@@ -216,7 +216,6 @@ def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | 
 
 
 def _aligned(robot: RobotResult, team_motion: TeamMotion | None) -> RobotResult:
-    """Add the aligned errors, without a motion of the team by the robot's own path."""
     motion, alignment = team_motion or (_motion([robot]), "trajectory")
     aligned = None if motion is None else _moved_rmse(motion, robot.smoothed_path, robot.truth)
     online = None
@@ -266,7 +265,7 @@ NEAREST_M = 0.1
 Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
 
 
-def gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
+def _gps_median(log: Collected, paths: Mapping[str, Path]) -> float | None:
     """Median distance [m] of smoothed poses from the other sensor's positions.
 
     Fits one rigid motion, lever arm and time shift per team by least absolute distances.
@@ -335,7 +334,6 @@ def _map_result(
     *,
     arbitrary: bool,
 ) -> MapResult:
-    """truth_from_map: motion by which unnamed landmarks are matched to true ones; None: unknown."""
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
     labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
@@ -378,7 +376,7 @@ def _map_result(
 
 
 def _name_points(log: Collected, found: m.Diagnosis) -> m.Diagnosis:
-    """Add the frame of points to the remedy of a contradiction that noise does not explain."""
+    """Add the frame of points to the remedy of a contradiction."""
     robots = in_order({robot for (robot, _), timed in log.timed.items() if timed.has_points})
     of = [robot for robot in robots if found.robot in ("", robot)]
     if not of or not contradicts(found):
@@ -388,7 +386,7 @@ def _name_points(log: Collected, found: m.Diagnosis) -> m.Diagnosis:
 
 
 def _is_refuted(found: m.Diagnosis, errors: MapErrors | None, *, arbitrary: bool) -> bool:
-    """Whether the errors are larger than a cause allows; in an arbitrary frame those of shape."""
+    """Whether the errors, in an arbitrary frame those of shape, exceed what a cause allows."""
     if found.cause != "noise_overestimated" or errors is None:
         return False
     if not arbitrary:
@@ -433,7 +431,6 @@ def _robot_result(
     own_map: MapErrors | None,
     is_in_frame: Callable[[str], bool],
 ) -> RobotResult:
-    """Evaluate one robot, unaligned; is_in_frame: whether a named frame is evaluated."""
     trajectories = log.messages(ch.TRAJECTORY, m.Trajectory, robot)
     truths = log.messages(ch.TRUTH, m.Truth, robot)
     truth, _ = _stack_paths([translate.trajectory_of(t) for t in truths], [])
@@ -505,7 +502,6 @@ def _stack_paths(
 
 
 def _peer_results(log: Collected) -> dict[str, PeerResult]:
-    """Result of every robot with a copy of the set."""
     found = {}
     for robot in log.robots:
         node = ch.robot_node(robot)

@@ -41,7 +41,7 @@ Found = Iterator[tuple[Kind, str, str]]
 
 @dataclass
 class EventDetector:
-    """Convert a run's ordered messages into events, each once."""
+    """Convert ordered messages into events, each once."""
 
     _alive: dict[str, bool] = field(default_factory=dict)
     _incarnations: dict[str, int] = field(default_factory=dict)
@@ -57,7 +57,7 @@ class EventDetector:
     _ended: bool = False
 
     def take(self, message: m.Message, now_ns: int) -> list[Event]:
-        """Detect the events of a message at team time `now_ns`."""
+        """Detect the events of a message at a team time."""
         return [Event(now_ns, *found) for found in self._events(message)]
 
     def _events(self, message: m.Message) -> Found:

@@ -132,7 +132,7 @@ def _named(of: object, paths: Mapping[str, str], *, arbitrary: bool = False) -> 
 
 
 def to_json(evaluation: Evaluation, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Collect the figures under their JSON names; `extra` replaces or adds some."""
+    """Figures under their JSON names; `extra` adds some."""
     fused, association = evaluation.map, evaluation.association
     states, arbitrary = evaluation.states, evaluation.arbitrary_frame
     gospa, matching = figure(fused, "gospa"), figure(fused, "matching")

@@ -28,7 +28,7 @@ _COST = "joint_cost_per_dof."
 
 @dataclass(frozen=True)
 class Series:
-    """Values by ascending team time [ns]; equal times in log order."""
+    """Values by ascending team time [ns]."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     values: Float[np.ndarray, " n"]
@@ -36,7 +36,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Innovations:
-    """Σ νᵀ S⁻¹ ν and degrees of freedom of one robot's windows."""
+    """Σ νᵀ S⁻¹ ν and degrees of freedom by window."""
 
     stamps_ns: Int64[np.ndarray, " n"]
     squared: Float[np.ndarray, " n"]
@@ -44,19 +44,19 @@ class Innovations:
 
     @property
     def per_dof(self) -> float | None:
-        """NIS per degree of freedom over the run."""
+        """NIS per degree of freedom."""
         total = self.total_dof
         return float(self.squared.sum()) / total if total else None
 
     @property
     def total_dof(self) -> int:
-        """Degrees of freedom over the run."""
+        """Degrees of freedom of all windows."""
         return int(self.dof.sum())
 
 
 @dataclass(frozen=True)
 class Latencies:
-    """Wall time [s] from the publication of a submap's first, last measurement to its first map."""
+    """Wall time [s] from a submap's first, last measurement to its first map."""
 
     first_s: Float[np.ndarray, " n"]
     last_s: Float[np.ndarray, " n"]
@@ -80,7 +80,7 @@ class History:
     events: tuple[Event, ...]
 
     def seconds(self, stamps_ns: Int64[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Team time since the first measurement [s], at least 0."""
+        """Team time since the first measurement [s]."""
         elapsed: Float[np.ndarray, " n"] = np.maximum(stamps_ns - self.start_ns, 0) * 1e-9
         return elapsed
 
@@ -202,7 +202,7 @@ class _Gathering:
 
 
 def history(samples: Iterable[Sample]) -> History:
-    """Compute the history of a run from its samples."""
+    """Compute the history of a run."""
     found = _Gathering()
     centre = PeersAsCentre()
     for sample in samples:

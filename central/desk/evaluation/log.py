@@ -69,7 +69,7 @@ class Collected:
 
     @property
     def robots(self) -> list[str]:
-        """Robots with measurements or truth, by name."""
+        """Robots with measurements or truth."""
         found = filter(None, map(channel_of, self.traffic))
         return in_order(
             self.measurements.keys() | {name for channel, name in found if channel in _OF_A_ROBOT}
@@ -81,23 +81,23 @@ class Collected:
         return found if isinstance(found, kind) else None
 
     def messages(self, channel: Channel, kind: type[M], robot: str) -> list[M]:
-        """Valid messages of a robot's channel, in log order."""
+        """Valid messages of a robot's channel."""
         found = map(self.sound, self.samples.get(channel.key(robot), []))
         return [each for each in found if isinstance(each, kind)]
 
     def of_all(self, channel: Channel, kind: type[M]) -> list[M]:
-        """Valid messages of a channel, by key, in log order."""
+        """Valid messages of a channel, by key."""
         names = sorted(name for key in self.samples if (name := channel.owner(key)) is not None)
         return [each for name in names for each in self.messages(channel, kind, name)]
 
     def figures(self, node: str, prefix: str = "") -> dict[str, float]:
-        """Newest figures of a node whose names begin with a prefix, without it."""
+        """Newest figures of a node by name behind the prefix."""
         status = self.newest(ch.STATUS, m.Status, node)
         found = {} if status is None else status.figures
         return {k.removeprefix(prefix): v for k, v in found.items() if k.startswith(prefix)}
 
     def sound(self, sample: Sample | None) -> m.Message | None:
-        """Decode a sample; None if invalid, which is counted once."""
+        """Decode a sample; an invalid one counts once."""
         if sample is None:
             return None
         try:
@@ -111,7 +111,7 @@ class Collected:
         self._refused.add(id(sample))
 
     def take(self, sample: Sample) -> None:
-        """Count a sample, and store it if its channel is collected."""
+        """Count a sample, and store it if collected."""
         if self.first_ns is None and sample.wall_ns:
             self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
@@ -122,7 +122,7 @@ class Collected:
             self._count(sample, known[1], odometry=known[0] is ch.ODOMETRY)
 
     def keep(self, sample: Sample) -> None:
-        """Store a message if its channel is collected, without its traffic."""
+        """Store a message if collected."""
         known = channel_of(sample.key)
         if known is not None and known[0] in _NEWEST:
             self.latest[sample.key] = sample

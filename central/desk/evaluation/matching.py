@@ -23,7 +23,7 @@ class Matching:
 
 @dataclass(frozen=True)
 class Gospa:
-    """Distance, cut-off c, RMS of assigned pairs, numbers of missed and false points."""
+    """Distance, cut-off, RMS of pairs, missed and false points."""
 
     distance_m: float
     cut_off_m: float
@@ -48,7 +48,7 @@ def assign(
 def nearest(
     means: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "m 2"]
 ) -> tuple[Int64[np.ndarray, " n"], Matching] | None:
-    """Row of each landmark's true position (−1: none); None below two true ones."""
+    """Row of each landmark's true position (−1: none)."""
     gate_m = half_spacing(true)
     if not gate_m:
         return None

@@ -26,7 +26,7 @@ USUAL = ("hybrid", "join")
 
 
 def figure(of: object, path: str) -> Any:
-    """Value at a path of attributes such as `smoothed.coverage`; None if absent."""
+    """Value at a path of attributes such as `smoothed.coverage`, or None."""
     for name in path.split("."):
         of = None if of is None else getattr(of, name)
     return of
@@ -60,19 +60,19 @@ class Consumption:
 
     @property
     def used(self) -> int | None:
-        """Number of measurements in the map, or used as initial pose."""
+        """Measurements in the map, or used as initial pose."""
         if not self.ledger:
             return None
         return sum(self.ledger.values()) - sum(self.rejected.values())
 
     @property
     def open(self) -> int | None:
-        """Number of published measurements neither used nor rejected."""
+        """Published measurements neither used nor rejected."""
         return None if self.consumed is None else self.published - self.consumed
 
     @property
     def not_used(self) -> str:
-        """Describe rejected and open measurements with reasons."""
+        """Describe rejected and open measurements."""
         parts = [f"{count} rejected ({reason})" for reason, count in self.rejected.items()]
         return ", ".join([*parts, f"{self.open} open"] if self.open else parts)
 
@@ -158,7 +158,7 @@ class RobotResult:
 
     @property
     def uplink_bytes_per_step(self) -> float | None:
-        """Uplink bytes of the rule's channel per odometry interval."""
+        """Uplink bytes per odometry interval."""
         steps = self.consumption.steps
         return None if self.uplink_bytes is None or not steps else self.uplink_bytes / steps
 
@@ -200,7 +200,7 @@ class Evaluation:
 
     @property
     def late(self) -> tuple[m.Diagnosis, ...]:
-        """Significant clock offsets of robots that are not mirrored."""
+        """Significant clock offsets."""
         out = {each.robot for each in self.mirrored}
         found = (clock_cause(robot, of) for robot, of in self.lateness.items() if robot not in out)
         return tuple(filter(None, found))
@@ -233,13 +233,13 @@ class Evaluation:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Robots missing from the final map, and all landmarks if it has none."""
+        """Robots missing from the final map, and all landmarks."""
         is_empty = self.map is not None and not len(self.map.ids)
         return (*not_in_the_map(self.states), *[NO_LANDMARK] * is_empty)
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Reasons that make a result no success: missing robots, or contradicting measurements."""
+        """Missing robots, and measurements that contradict each other."""
         of_map = () if self.map is None else self.map.diagnosis
         if not any(contradicts(each) and not each.robot for each in of_map):
             return self.missing
@@ -275,5 +275,5 @@ class Evaluation:
 
     @property
     def matched_by(self) -> str:
-        """Method that matched unnamed landmarks to true ones."""
+        """Method that matched unnamed landmarks."""
         return "" if self.map is None or self.map.matching is None else str(self.map.matching)

@@ -37,7 +37,7 @@ BATCHES = 20_000
 
 @dataclass
 class TruthFrames:
-    """Frames fixed by a known initial pose or a survey, which have truth; without any, all."""
+    """Frames that have truth: of known initial poses or a survey; without any, all."""
 
     _starts: dict[str, bool] = field(default_factory=dict)
 
@@ -51,7 +51,7 @@ class TruthFrames:
 
     @property
     def none_is_known(self) -> bool:
-        """Whether initial poses exist and all are unknown."""
+        """Whether all initial poses are unknown."""
         return bool(self._starts) and not any(self._starts.values())
 
 
@@ -82,7 +82,7 @@ class TrueLandmarks:
     def match(
         self, ids: UInt32[np.ndarray, " L"]
     ) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
-        """True positions by number (zero where unknown), and a mask of known ones."""
+        """True positions by number (else zero), and a mask of known ones."""
         truth, known = np.zeros((len(ids), 2)), np.isin(ids, self.ids)
         truth[known] = self.positions[np.searchsorted(self.ids, ids[known])]
         return truth, known
@@ -121,7 +121,7 @@ class NeesTally:
 
     @property
     def mean(self) -> float | None:
-        """Mean NEES per degree of freedom, or None."""
+        """Mean NEES per degree of freedom."""
         return self.nees_per_dof / self.count if self.count else None
 
     @property
@@ -151,7 +151,7 @@ class RunningErrors:
             self._truth.append(batch)
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether a pose at this time is far enough from the last."""
+        """Whether a pose is far enough from the last."""
         return self.last_ns is None or stamp_ns >= self.last_ns + self.spacing_ns
 
     def take_pose(self, message: m.PoseEstimate) -> None:
@@ -164,7 +164,7 @@ class RunningErrors:
         self._poses.append((message.stamp_ns, pose, P))
 
     def known(self) -> PoseErrors | None:
-        """Errors of the poses whose truth has arrived since the last call."""
+        """Errors of poses whose truth has arrived since the last call."""
         until = int(self._truth[-1].stamps_ns[-1]) if self._truth else -(2**63)
         due = []
         while self._poses and self._poses[0][0] <= until:
@@ -181,7 +181,7 @@ class RunningErrors:
         return poses[0] if known[0] else None
 
     def forget(self, before_ns: int) -> None:
-        """Discard older truth and poses, except the last truth batch before this time."""
+        """Discard older poses, and truth but the last batch before."""
         while len(self._truth) > 1 and int(self._truth[1].stamps_ns[0]) < before_ns:
             self._truth.popleft()
         while self._poses and self._poses[0][0] < before_ns:

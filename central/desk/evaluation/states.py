@@ -29,7 +29,7 @@ class RobotState(NamedTuple):
 def robot_states(
     log: Collected, fused: m.FusedMap | None, robots: Collection[str]
 ) -> dict[str, RobotState]:
-    """State of every robot, and of every saved map as `map-<name>`."""
+    """State of every robot, and of saved maps as `map-<name>`."""
     if fused is None:
         return {}
     members = {member.robot for member in fused.members}

@@ -62,8 +62,7 @@ class _Robot:
         yield Answer(names.topic("odometry"), "nav_msgs/msg/Odometry", stamp_ns, data)
 
 
-def answers_of(log: Log) -> Iterator[Answer]:
-    """Convert a log to ROS 2 messages; at last the smoothed and the true poses."""
+def _answers_of(log: Log) -> Iterator[Answer]:
     robots: dict[str, _Robot] = {}
     team = Answers(ros.Names(TEAM_SPACE))
     final = False
@@ -101,7 +100,6 @@ def _smoothed(log: Log) -> Iterator[Answer]:
 
 
 def _true(log: Log) -> Iterator[Answer]:
-    """True poses in `world`, and world → map, in an arbitrary frame by alignment."""
     evaluation = evaluate(log.samples())
     starts_ns = list[int]()
     for robot, result in evaluation.robots.items():
@@ -122,10 +120,10 @@ def _true(log: Log) -> Iterator[Answer]:
 
 
 def export_rosbag2(log: Log, folder: Path) -> dict[str, int]:
-    """Write a bag (MCAP) into a new folder; return message counts by topic. Raises LogError."""
+    """Write a bag (MCAP); return message counts by topic. Raises LogError."""
     counts = dict[str, int]()
     with new_bag(folder) as bag:
-        for answer in answers_of(log):
+        for answer in _answers_of(log):
             bag.write(answer.topic, answer.kind, answer.stamp_ns, answer.data, answer.latched)
             counts[answer.topic] = counts.get(answer.topic, 0) + 1
     if not counts:

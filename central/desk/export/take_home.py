@@ -59,8 +59,8 @@ class TakenHome:
 
 
 def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
-    """Compute paths at keyframe rate and counts; progress receives each robot's name."""
-    counts, classes = measurement_counts(found), landmark_classes(found)
+    """Compute the tables' contents."""
+    counts, classes = _measurement_counts(found), landmark_classes(found)
     return TakenHome(smoothed_paths(found, progress), counts, _datum(found), classes)
 
 
@@ -98,8 +98,7 @@ def _datum(found: Recorded) -> Datum | None:
     return datum_of(found.central_config()[0], maps[-1], found.saved_maps.values())
 
 
-def measurement_counts(found: Recorded) -> Mapping[int, int]:
-    """Number of measurements of each landmark of the final map."""
+def _measurement_counts(found: Recorded) -> Mapping[int, int]:
     counts = Counter[int]()
     for stream in found.measurements.values():
         for message in stream.values():
@@ -128,7 +127,7 @@ def _detections(submap: m.Submap) -> Iterator[tuple[Member, int]]:
 
 
 def write_map(fused: MapResult, taken: TakenHome, folder: FilePath) -> list[FilePath]:
-    """Write map.csv and map.json with 2 × 2 covariances; return the files."""
+    """Write map.csv and map.json with 2 × 2 covariances."""
     datum, states = taken.datum, {each.landmark: each.state for each in fused.changes}
     rows: list[dict[str, Any]] = []
     for landmark, (x, y), ((xx, xy), (_, yy)) in zip(
@@ -172,7 +171,7 @@ def write_map(fused: MapResult, taken: TakenHome, folder: FilePath) -> list[File
 def write_geojson(
     fused: MapResult, paths: Mapping[str, SmoothedPath], folder: FilePath, datum: Datum
 ) -> FilePath:
-    """Write map.geojson (RFC 7946); return it. sigma_m: larger semi-axis of the 1σ ellipse."""
+    """Write map.geojson (RFC 7946); sigma_m: larger semi-axis of the 1σ ellipse."""
     places = geodetic_from_local(datum, fused.means)[:, ::-1].tolist()
     sigmas = np.sqrt(np.linalg.eigvalsh(translate.blocks_of(fused.covariance))[:, 1]).tolist()
     features = [
@@ -256,7 +255,7 @@ def write_trajectories(evaluation: Evaluation, folder: FilePath) -> list[FilePat
 
 
 def export_tum(log: Log, folder: FilePath) -> list[FilePath]:
-    """Write every robot's paths; return the files. Raises LogError without a path."""
+    """Write every robot's paths. Raises LogError without one."""
     written = write_trajectories(evaluate(log.samples()), folder)
     if not written:
         remedy = "`teamslam rerun` computes them, `--format csv` writes what there is"

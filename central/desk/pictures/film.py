@@ -26,18 +26,18 @@ FRAMES, LAST_FRAMES, PER_S = 136, 24, 8
 SIZE_IN, DPI = 5.0, 96
 
 
-class MapAt(NamedTuple):
-    """A map of the running team: team time [ns], landmarks, covariances."""
+class _MapAt(NamedTuple):
+    """Map at a team time [ns]: landmarks, covariances."""
 
     stamp_ns: int
     means: Float[np.ndarray, "L 2"]
     blocks: Float[np.ndarray, "L 2 2"]
 
 
-def maps_over_time(maps: Iterable[m.FusedMap]) -> list[MapAt]:
+def maps_over_time(maps: Iterable[m.FusedMap]) -> list[_MapAt]:
     """Sort maps by team time."""
     found = [
-        MapAt(each.stamp_ns, translate.landmarks_of(each)[1], translate.landmark_blocks_of(each))
+        _MapAt(each.stamp_ns, translate.landmarks_of(each)[1], translate.landmark_blocks_of(each))
         for each in maps
     ]
     return sorted(found, key=lambda each: each.stamp_ns)
@@ -45,7 +45,7 @@ def maps_over_time(maps: Iterable[m.FusedMap]) -> list[MapAt]:
 
 def draw_film(
     evaluation: Evaluation,
-    maps: Sequence[MapAt],
+    maps: Sequence[_MapAt],
     path: FilePath,
     progress: Callable[[float], None] = lambda _: None,
 ) -> bool:

@@ -113,7 +113,7 @@ def in_the_maps_frame(evaluation: Evaluation) -> Evaluation:
 
 
 def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
-    """Draw errors of x, y and heading over team time with ±3σ; False without truth."""
+    """Draw errors over team time with ±3σ; False without truth."""
     if evaluation.arbitrary_frame:
         return False
     shown = {n: r for n, r in evaluation.robots.items() if r.online or r.smoothed}
@@ -144,7 +144,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
 def new_figure(
     width: float, height: float, rows: int, columns: int
 ) -> "tuple[Figure, list[list[Axes]]]":
-    """Create an Agg figure without pyplot's global state, and its axes by row and column."""
+    """Create an Agg figure without pyplot, and its axes by row and column."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -174,7 +174,6 @@ def _draw_paths(
     dense: SmoothedPath | None,
     apart: bool,
 ) -> None:
-    """apart: the online path is not in the map frame, so it is omitted."""
     truth, smoothed = _thinned(robot.truth), robot.smoothed_path
     line = smoothed if dense is None else _thinned(Path(dense.stamps_ns, dense.poses))
     known = truth if len(truth.stamps_ns) else line
@@ -295,7 +294,7 @@ def _magnified_truth(
 
 
 def _label_offsets(points: Float[np.ndarray, "L 2"]) -> Float[np.ndarray, "L 2"]:
-    """Offset of each point's label [typographic points], away from its neighbours."""
+    """Offset of each label [pt], away from its neighbours."""
     reach = max(float(np.ptp(points, axis=0).max()) / 20.0, 1e-9)
     offsets = np.empty_like(points)
     for i, point in enumerate(points):
@@ -398,7 +397,7 @@ LOGARITHMIC_FROM = 12.0
 def _sum_in_bins(
     history: History, stamps_ns: Int64[np.ndarray, " n"], *values: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " b"], list[Float[np.ndarray, " b"]]]:
-    """Sum each value over the filled ones of BINS intervals; return their middles [s] and sums."""
+    """Middles [s] of the filled ones of BINS intervals, and sums in them."""
     edges = np.linspace(0.0, max((history.end_ns - history.start_ns) * 1e-9, 1e-9), BINS + 1)
     at = np.searchsorted(edges, history.seconds(stamps_ns), "right")
     where = np.clip(at - 1, 0, BINS - 1)
@@ -408,7 +407,7 @@ def _sum_in_bins(
 
 
 def consistency_picture(evaluation: Evaluation, history: History, path: FilePath) -> bool:
-    """Draw NEES, NIS and joint cost per dof over team time; False if all are empty."""
+    """Draw NEES, NIS and joint cost over team time; False if all are empty."""
     has_poses = any(r.online for r in evaluation.robots.values()) and not evaluation.arbitrary_frame
     has_nis = any(each.per_dof is not None for each in history.innovations.values())
     panels = [

@@ -23,7 +23,7 @@ INCHES = {"in": 1.0, "mm": 1.0 / 25.4, "cm": 1.0 / 2.54, "pt": 1.0 / 72.27}
 
 
 def parsed_width(text: str) -> float:
-    """Parse a width such as 3.5in, 89mm, 8.9cm or 252pt [inches]; raises ValueError."""
+    """Parse a width such as 3.5in or 89mm [inches]; raises ValueError."""
     found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(in|mm|cm|pt)", text.strip())
     width = float(found[1]) * INCHES[found[2]] if found else 0.0
     if not LEAST_IN <= width <= MOST_IN:
@@ -105,7 +105,7 @@ def drawn_in(style: Style) -> Iterator[None]:
 
 
 def save(figure: "Figure", path: Path) -> None:
-    """Write a picture in its suffix's format; on paper without titles."""
+    """Write a picture in its suffix's format."""
     style = _current.get()
     if style.look is not Look.PAPER:
         figure.savefig(path, dpi=DPI)

@@ -29,7 +29,7 @@ _ORIGIN = ("git.commit", "seed", "version.teamslam", "version.python")
 
 
 def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str, Path]:
-    """Draw a run's pictures; return the non-empty ones by name."""
+    """Draw a run's non-empty pictures."""
     evaluation, history = run.evaluation, run.history
     draw: dict[Picture, Callable[[Path], bool]] = {
         Picture.MAP: lambda path: map_picture(evaluation, path, run.paths),
@@ -43,7 +43,7 @@ def write_pictures(run: Run, directory: Path, style: Style = SCREEN) -> dict[str
 
 
 def write_report(run: Run, directory: Path, figures: Mapping[str, Any]) -> list[Path]:
-    """Write report.html, report.json, tables, pictures and trajectories; return the files."""
+    """Write page, figures, tables, pictures and trajectories; return the files."""
     directory.mkdir(parents=True, exist_ok=True)
     pictures = write_pictures(run, directory, PAGE)
     page, data = directory / "report.html", directory / "report.json"

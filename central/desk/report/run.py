@@ -16,7 +16,7 @@ from teamslam.central.desk.paths import SmoothedPath
 
 @dataclass(frozen=True)
 class Run:
-    """A run from its log; ledger: None if not requested, or without inputs (`no_ledger`)."""
+    """A run from its log; ledger: None without inputs (`no_ledger`)."""
 
     evaluation: Evaluation
     history: History
@@ -32,7 +32,7 @@ class Run:
         return self.taken_home.paths
 
     def trajectories(self) -> dict[str, dict[str, TrajectoryErrors]]:
-        """Errors by robot and kind of path ("smoothed", "online")."""
+        """Errors by robot and kind of path."""
         found: dict[str, dict[str, TrajectoryErrors]] = {}
         for name, robot in self.evaluation.robots.items():
             for kind, path in (("smoothed", robot.smoothed_path), ("online", robot.online_path)):
@@ -43,7 +43,7 @@ class Run:
 
 
 def nis_line(history: History) -> str | None:
-    """NIS per degree of freedom of every robot in one line, or None."""
+    """NIS per degree of freedom of every robot in one line."""
     per_dof = {name: of.per_dof for name, of in history.innovations.items()}
     parts = [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]
     return f"NIS per dof: {', '.join(parts)}" if parts else None

@@ -47,7 +47,7 @@ class Sheet(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Column: heading, path of attributes or function, format, factor to the shown unit."""
+    """Heading, path of attributes or function, format, factor to the shown unit."""
 
     heading: str
     of: str | Callable[[Any], float | str | None]
@@ -81,7 +81,7 @@ def _sheet(
 
 
 def comparable(evaluation: Evaluation, robot: RobotResult) -> RobotResult:
-    """Robot without the errors that are meaningless in an arbitrary frame."""
+    """Robot without errors that are meaningless in an arbitrary frame."""
     return replace(robot, smoothed=None, online=None) if evaluation.arbitrary_frame else robot
 
 
@@ -180,7 +180,6 @@ def _error_rows(evaluation: Evaluation, errors: MapErrors | None) -> Rows:
 
 
 def _describe_nees(evaluation: Evaluation, errors: MapErrors) -> str:
-    """Describe the map NEES and whether chance explains it."""
     if errors.nees_per_dof > ABSURD_NEES:
         again = figure(evaluation, "scenario.fusion") in ("kalman", "kalman-per-axis")
         why = " (measurements counted again)" if again else ""
@@ -377,13 +376,13 @@ _OWN = (
 
 
 def is_unfused(evaluation: Evaluation) -> bool:
-    """Whether each robot has its own map, without a fused one."""
+    """Whether each robot has its own map alone."""
     empty = evaluation.map is not None and not len(evaluation.map.ids)
     return empty and any(robot.own_map is not None for robot in evaluation.robots.values())
 
 
 def own_sheet(evaluation: Evaluation) -> Sheet:
-    """Errors, NEES and coverage of every robot's own map."""
+    """Errors, NEES and coverage of own maps."""
     note = "each robot's own last map; aligned: moved rigidly onto the truth"
     return _sheet("robot", _OWN, evaluation.robots.items(), note)
 
@@ -409,7 +408,7 @@ NIS_NOTE = (
 
 
 def consistency_sheet(run: Run) -> Sheet:
-    """Consistency: NEES and coverage with truth, else NIS and cost."""
+    """NEES and coverage with truth, NIS and cost."""
     of, innovations = run.evaluation, run.history.innovations
     rows = []
     for name in in_order(of.robots.keys() | innovations.keys() | of.cost_by_robot.keys()):
@@ -471,7 +470,7 @@ LATENCY_NOTE = (
 
 
 def latency_sheet(run: Run) -> Sheet:
-    """Median, 95 % quantile and maximum of each robot's latencies."""
+    """Quantiles of each robot's latencies."""
     return _sheet("robot", _LATENCY, run.history.latencies.items(), LATENCY_NOTE)
 
 
@@ -503,7 +502,7 @@ _OUTLIERS = (
 
 
 def rejection_sheets(ledger: Ledger) -> tuple[Sheet, Sheet]:
-    """Rejected measurements with reasons, and detections rejected as outliers, by submap."""
+    """Rejected measurements, and detections rejected as outliers."""
     rejected, outliers = (
         ((short(named((each.robot, each.incarnation))), each) for each in of)
         for of in (ledger.rejected, ledger.outliers)

@@ -20,7 +20,7 @@ from teamslam.team.wire.bus import Outgoing
 
 
 def recompute_centre(log: Recorded) -> dict[Identity, m.Message]:
-    """Recompute messages from the inputs of the recorded maps, by input names."""
+    """Recompute messages from the inputs of the recorded maps."""
     maps, finals = (log.of(m.FusedMap, each) for each in (ch.FUSED_MAP, ch.FINAL_MAP))
     found: dict[Identity, m.Message] = {}
     for out in _recompute(log, maps, finals):
@@ -102,7 +102,7 @@ def _extends(
 
 
 def recorded_map(log: Recorded, name: str) -> m.SavedMap:
-    """Make a saved map of a log's final map from its set. Raises RerunError, NothingToSaveError."""
+    """Make a saved map of a log's final map. Raises RerunError, NothingToSaveError."""
     found = log.of(m.FusedMap, ch.FINAL_MAP) or log.of(m.FusedMap, ch.TEAM_FINAL)
     finals = [each for each in found if each.rule == "join"]
     if not finals:
@@ -138,7 +138,7 @@ class _RecordedSet:
             self._priors_of.setdefault(prior.digest, set()).add((prior.robot, prior.incarnation))
 
     def chains(self, fused: m.FusedMap) -> Mapping[Stream, Sequence[m.Submap]] | None:
-        """Submaps that a map names; None if one or its inputs are missing."""
+        """Submaps that a map names; None if any is missing."""
         stored = self._store.chains
         named = (*fused.members, *fused.left_out)
         vector = {(x.robot, x.incarnation): x.sequence for x in named}

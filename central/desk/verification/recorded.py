@@ -27,11 +27,11 @@ Identity = tuple[object, ...]
 
 
 class RerunError(ValueError):
-    """Log that cannot be recomputed, for want of the named input."""
+    """Log that cannot be recomputed."""
 
 
 class RecordedMeasurements(Mapping[int, m.Measurement]):
-    """Measurements of one incarnation by number; of a contradicted number the first."""
+    """Measurements of one incarnation by number; the first of equal ones."""
 
     def __init__(self) -> None:
         self._messages: dict[int, m.Measurement] = {}
@@ -77,7 +77,7 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
 
 @dataclass(frozen=True)
 class RecordedOutput:
-    """Recorded message that can be recomputed, as sample and decoded."""
+    """Recomputable message."""
 
     sample: Sample
     message: m.Message
@@ -146,7 +146,7 @@ class Recorded:
                 pass
 
     def of(self, kind: type[M], *channels: ch.Channel) -> list[M]:
-        """Recorded messages of a kind by channel, each in log order."""
+        """Recorded messages of a kind by channel, in log order."""
         outputs = (each for channel in channels for each in self.outputs_of(channel))
         return [each.message for each in outputs if isinstance(each.message, kind)]
 
@@ -156,7 +156,7 @@ class Recorded:
 
     @property
     def contradicted(self) -> list[m.Measurement]:
-        """First copies of measurements with two different contents."""
+        """Measurements with two different contents."""
         streams = self.measurements.values()
         return [stream[number] for stream in streams for number in stream.contradicted]
 
@@ -168,7 +168,7 @@ class Recorded:
         return in_order(names | {each.robot for each in self.of(m.Done, ch.ROBOT_DONE)})
 
     def incarnations(self, robot: str) -> list[int]:
-        """A robot's incarnations with measurements, in order."""
+        """A robot's incarnations with measurements."""
         return sorted(incarnation for name, incarnation in self.measurements if name == robot)
 
     def submaps(self) -> Mapping[Stream, dict[int, m.Submap]]:
@@ -179,7 +179,7 @@ class Recorded:
         return found
 
     def sightings(self) -> Mapping[tuple[str, int, int], list[m.SightingFactor]]:
-        """Inter-robot measurements by (robot, incarnation, sequence) of their submap."""
+        """Inter-robot measurements by submap."""
         found: dict[tuple[str, int, int], list[m.SightingFactor]] = {}
         for sighting in self.of(m.SightingFactor, ch.SIGHTING_FACTOR):
             name = (sighting.robot, sighting.incarnation, sighting.sequence)
@@ -187,7 +187,7 @@ class Recorded:
         return found
 
     def robot_config(self, robot: str) -> tuple[RobotConfig, bytes]:
-        """Announced configuration of a robot, and its digest; raises RerunError."""
+        """Configuration of a robot and its digest; raises RerunError."""
         return self._announced(ch.robot_node(robot), RobotConfig, f"the configuration of {robot}")
 
     def central_config(self) -> tuple[CentralConfig, bytes]:
@@ -224,7 +224,7 @@ def index_log(log: Log) -> Recorded:
 
 @lru_cache(maxsize=4096)
 def identity(key: str, message: m.Message) -> Identity:
-    """Message key, followed by the names of its inputs."""
+    """Message key, and names of inputs."""
     match message:
         case m.Submap():
             names: Identity = (

@@ -29,7 +29,7 @@ WithdrawnAt = Collection[tuple[int, int]]
 """Own poses that were also published on team/pose, by (incarnation, stamp)."""
 
 
-class RecordedPoses(RunningPoses):
+class _RecordedPoses(RunningPoses):
     """Poses at the log's stamps, each with the prior that it names.
 
     Priors depend on arrival times, which a log does not have.
@@ -43,7 +43,6 @@ class RecordedPoses(RunningPoses):
         self._withdrawn = withdrawn
 
     def publish(self, stamp_ns: int, estimator: PoseEstimator) -> list[Outgoing]:
-        """Poses of this stamp, with every prior that a recorded one names."""
         out: list[Outgoing] = []
         incarnation = estimator.writer.incarnation
         for prior in self._recorded.get((incarnation, stamp_ns), ()):
@@ -54,9 +53,7 @@ class RecordedPoses(RunningPoses):
         return out
 
 
-class RecomputedRobot:
-    """Robot node over recorded messages, with poses at the recorded stamps."""
-
+class _RecomputedRobot:
     def __init__(
         self,
         config: RobotConfig,
@@ -65,30 +62,28 @@ class RecomputedRobot:
         withdrawn: WithdrawnAt = (),
         **options: Any,
     ) -> None:
-        poses = RecordedPoses(config, recorded, withdrawn)
+        poses = _RecordedPoses(config, recorded, withdrawn)
         self.node = robot_node(config, announced=digest, poses=poses, **options)
         self._boundary = Boundary(ch.robot_node(config.id))
 
     def given(self, message: m.Message) -> list[Outgoing]:
-        """Handle a message with exceptions contained."""
         return self._boundary.hand(self.node, message)
 
     def take_known_map(self, log: Recorded) -> None:
-        """Handle the log's map, if the robot localises in one."""
         if log.known_map is not None and ch.KNOWN_MAP in self.node.listens:
             self.given(log.known_map)
 
 
-NewRobot = Callable[[], RecomputedRobot]
+NewRobot = Callable[[], _RecomputedRobot]
 
 
 def recompute_robot(log: Recorded, robot: str) -> dict[Identity, m.Message]:
-    """Recompute the messages that follow from a robot's measurements, by input names."""
+    """Recompute the messages that follow from a robot's measurements."""
     config, digest = log.robot_config(robot)
     named, withdrawn = _priors_named(log, robot), _withdrawn_at(log, robot)
 
-    def new() -> RecomputedRobot:
-        robot = RecomputedRobot(config, digest, named, withdrawn)
+    def new() -> _RecomputedRobot:
+        robot = _RecomputedRobot(config, digest, named, withdrawn)
         robot.take_known_map(log)
         return robot
 
@@ -187,7 +182,7 @@ def _life(
 
 def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
     """Run a robot's node, without a centre, over an incarnation; return how many it consumed."""
-    node = RecomputedRobot(*log.robot_config(robot), {}, **options)
+    node = _RecomputedRobot(*log.robot_config(robot), {}, **options)
     node.take_known_map(log)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = log.measurements.get((robot, incarnation), RecordedMeasurements())

@@ -52,7 +52,6 @@ def _arrays_of(kind: type[m.Message]) -> frozenset[str]:
 
 
 def _first_difference(recorded: m.Message, recomputed: m.Message, *, exact: bool) -> Field | None:
-    """Find the first differing field, within the tolerance unless `exact`."""
     arrays = _arrays_of(type(recorded))
     for name in recorded.__struct_fields__:
         a, b = getattr(recorded, name), getattr(recomputed, name)
@@ -168,7 +167,7 @@ class Verification:
 
     @property
     def first(self) -> Difference | None:
-        """First difference, causes first; else the first message that lacks an input."""
+        """First difference, causes first; else the first that lacks an input."""
         found = [c.first for c in self.channels if c.first is not None]
         return min(found, key=lambda each: each.lacks, default=None)
 

@@ -16,7 +16,7 @@ PATH_POINTS = 1_000
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Map landmarks: L ids, positions [m], covariances (xx, xy, yy) [m²]."""
+    """L ids, positions [m], covariances (xx, xy, yy) [m²]."""
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]

@@ -27,7 +27,7 @@ VIEWED = frozenset((*ViewerNode.listens, ch.ALIVE))
 def for_viewer(
     sample: Sample, channels: Collection[ch.Channel] = VIEWED
 ) -> tuple[ch.Channel, m.Message] | None:
-    """Channel and message of a sample of these channels; None for others."""
+    """Channel and message of a sample of these channels."""
     if ch.row_of(sample.key) not in channels:
         return None
     sound = try_open(sample)
@@ -52,7 +52,7 @@ class Viewing:
 
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
-    """Yield samples, each followed by its views; recorded views are omitted."""
+    """Yield samples, each followed by its views, without recorded ones."""
     viewing, centre = Viewing(), PeersAsCentre()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
@@ -79,7 +79,7 @@ class Drawn(NamedTuple):
 
 
 def export_views(log: Log, out: Path) -> Drawn:
-    """Write a log with its views redrawn to a new log. Raises LogError, RecorderError."""
+    """Write a log with its views redrawn. Raises LogError, RecorderError."""
     written, drawn, before = 0, 0, 0
     with Recorder(out, log.team, log.metadata) as recorder:
 

@@ -33,7 +33,7 @@ _LAST_NS = 2**32 * 1_000_000_000 - 1
 
 
 def scene(entities: Iterable[Fields]) -> bytes:
-    """Scene update; an entity replaces an earlier one of its name."""
+    """Scene update; an entity replaces one of its name."""
     return _encode(SceneUpdate, entities=list(entities))
 
 
@@ -163,7 +163,6 @@ def _encode(kind: Callable[..., Any], **fields: Any) -> bytes:
 
 
 def _stamp(stamp_ns: int) -> Fields:
-    """Team time, clamped to 32 bits of seconds."""
     seconds, nanos = divmod(min(max(stamp_ns, 0), _LAST_NS), 1_000_000_000)
     return {"seconds": seconds, "nanos": nanos}
 

@@ -85,7 +85,6 @@ class _Robot:
         return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
     def leave(self) -> None:
-        """Discard poses and errors, which left the team's frame."""
         self.coming.clear()
         self.estimate = self.last_error = None
         self.track = Track()
@@ -272,7 +271,6 @@ class ViewerNode:
             yield views.PATHS.key(), self._paths(now_ns, size, motion)
 
     def _go_to(self, now_ns: int, *, last: bool) -> None:
-        """Advance all parts to this time; the last view has the final map."""
         self._now_ns = now_ns
         while self._maps and (last or self._maps[0].stamp_ns <= now_ns):
             self._fused = self._maps.popleft()

@@ -85,7 +85,7 @@ class _Stream:
 
 
 class PageFrames:
-    """Convert samples to frames: `count` samples, `take` their messages, `flush` frames."""
+    """Convert samples to frames: `count`, `take`, `flush`."""
 
     def __init__(self) -> None:
         self._out: list[str] = []
@@ -108,7 +108,7 @@ class PageFrames:
         self._add_frame("hello", team=team, title=title, colours=ROBOT_COLOURS, live=live)
 
     def count(self, sample: Sample) -> None:
-        """Count a sample as traffic; emit a link for a submap or prior."""
+        """Count a sample as traffic, or as a link."""
         channel, name = ch.channel_of(sample.key) or (None, "")
         if self._origin_ns is None and channel in _BEGIN:
             self._origin_ns = sample.stamp_ns
@@ -123,7 +123,7 @@ class PageFrames:
             self._add_frame("link", t=t, a=a, b=b)
 
     def flush(self, now_ns: int | None = None) -> list[str]:
-        """Return the frames since the last call; now_ns: team time of the robots."""
+        """Return new frames; now_ns: team time of the robots."""
         for robot, stream in self._streams.items():
             self._add_errors(stream)
             for kind, (times, values) in stream.rows.items():
@@ -245,7 +245,6 @@ class PageFrames:
     def _take_measurements(
         self, message: m.Observations | m.Points | m.Detections | m.Sightings
     ) -> None:
-        """Send places in the robot's frame, each landmark at most once in SEEN_NS."""
         stream, at = self._streams[message.robot], message.stamp_ns
         if isinstance(message, m.Points):
             places = floats(message.positions, "positions").reshape(-1, 2)

@@ -91,7 +91,7 @@ class Feed:
     _greeted: bool = False
 
     def read_more(self, *, growing: bool) -> bool:
-        """Read new samples; return whether there were any. A finished log ends here."""
+        """Read new samples; return whether there were any."""
         try:
             samples = self.tail.more()
         except (LogError, OSError) as error:
@@ -185,9 +185,7 @@ async def _pump(
             await sink.send(frame)
 
 
-class PageServer:
-    """Server of one page in its own event loop."""
-
+class _PageServer:
     def __init__(self, feed: Feed, host: str, *, growing: bool) -> None:
         self._feed = feed
         self._host = host
@@ -196,14 +194,12 @@ class PageServer:
         self._frame_ready = asyncio.Condition()
 
     async def start(self, port: int) -> Server:
-        """Listen. Raises OSError."""
         return await serve(
             self._stream, self._host, port, process_request=self._answer, compression=None,
             max_size=1024,
         )  # fmt: skip
 
     async def read(self, stop: asyncio.Event) -> None:
-        """Read the log until its end or `stop`."""
         while not (self._feed.ended or stop.is_set()):
             some = await asyncio.to_thread(self._feed.read_more, growing=self._growing)
             async with self._frame_ready:
@@ -279,7 +275,7 @@ def serving(
 ) -> Iterator[Shown]:
     """Serve page and Foxglove on a thread. Raises ServerError."""
     runner, stop = asyncio.Runner(), asyncio.Event()
-    page = PageServer(feed, host, growing=growing)
+    page = _PageServer(feed, host, growing=growing)
     at = f"[{host}]" if ":" in host else host
     servers: list[Server] = []
 
