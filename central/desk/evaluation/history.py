@@ -3,8 +3,10 @@
 from array import array
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample, try_open
 
+S = TypeVar("S")
+T = TypeVar("T")
 _NO_SPAN = (2**63 - 1, -(2**63))
 _CHANNELS = (
     ch.START, ch.SUBMAP, ch.FUSED_MAP, ch.FINAL_MAP, ch.INNOVATION, ch.TRUTH_LANDMARKS, ch.STATUS,
@@ -85,22 +89,6 @@ class History:
         return elapsed
 
 
-@dataclass
-class _Column:
-    stamps: "array[int]" = field(default_factory=lambda: array("q"))
-    values: "array[float]" = field(default_factory=lambda: array("d"))
-
-    def take(self, stamp_ns: int, value: float) -> None:
-        self.stamps.append(stamp_ns)
-        self.values.append(value)
-
-    @property
-    def series(self) -> Series:
-        stamps = np.array(self.stamps, np.int64)
-        order = np.argsort(stamps, kind="stable")
-        return Series(stamps[order], np.array(self.values, np.float64)[order])
-
-
 class _Clocks:
     """Wall clocks [ns] of a stream's measurements, in order; 16 bytes each."""
 
@@ -121,29 +109,26 @@ class _Clocks:
         return self._clocks[k] if known else None
 
 
-@dataclass
+_Rows = list[tuple[int, float]]
+"""Stamps [ns] and values."""
+
+
 class _Gathering:
-    innovations: dict[str, dict[tuple[int, int], m.Innovation]] = field(
-        default_factory=lambda: defaultdict(dict)
-    )
-    """By (incarnation, window): a resumed robot repeats some."""
-    map_nees: _Column = field(default_factory=_Column)
-    map_cost: _Column = field(default_factory=_Column)
-    robot_cost: dict[str, _Column] = field(default_factory=lambda: defaultdict(_Column))
-    detector: EventDetector = field(default_factory=EventDetector)
-    events: list[Event] = field(default_factory=list)
-    published: dict[tuple[str, int], _Clocks] = field(default_factory=lambda: defaultdict(_Clocks))
-    unused: dict[tuple[str, int], dict[int, tuple[int, int]]] = field(
-        default_factory=lambda: defaultdict(dict)
-    )
-    """First and last measurement of the submaps that no map has used, by stream and sequence."""
-    latencies: dict[str, list[tuple[float, float]]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
-    truth: TrueLandmarks = field(default_factory=TrueLandmarks)
-    frames: TruthFrames = field(default_factory=TruthFrames)
-    measured_ns: tuple[int, int] = _NO_SPAN
-    logged_ns: tuple[int, int] = _NO_SPAN
+    def __init__(self) -> None:
+        self.innovations: dict[str, dict[tuple[int, int], m.Innovation]] = defaultdict(dict)
+        """By (incarnation, window): a resumed robot repeats some."""
+        self.map_nees: _Rows = []
+        self.map_cost: _Rows = []
+        self.robot_cost: dict[str, _Rows] = defaultdict(list)
+        self.detector = EventDetector()
+        self.events: list[Event] = []
+        self.published: dict[tuple[str, int], _Clocks] = defaultdict(_Clocks)
+        self.unused: dict[tuple[str, int], dict[int, tuple[int, int]]] = defaultdict(dict)
+        """First and last measurement of submaps that no map has used, by stream and sequence."""
+        self.latencies: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        self.truth = TrueLandmarks()
+        self.frames = TruthFrames()
+        self.measured_ns = self.logged_ns = _NO_SPAN
 
     def take(self, sample: Sample) -> None:
         self.logged_ns = _extend(self.logged_ns, sample.stamp_ns)
@@ -158,8 +143,8 @@ class _Gathering:
     def take_contents(self, sample: Sample) -> None:
         if ch.row_of(sample.key) not in _CHANNELS:
             return
-        if (sound := try_open(sample)) is None:
-            return  # counted by the evaluation
+        if (sound := try_open(sample)) is None:  # counted by the evaluation
+            return
         _, name, message = sound
         self.events += self.detector.take(message, sample.stamp_ns)
         del self.events[MOST:]
@@ -179,17 +164,17 @@ class _Gathering:
             case m.Status() if name == "central":
                 for figure, value in message.figures.items():
                     if figure.startswith(_COST):
-                        of_robot = self.robot_cost[figure.removeprefix(_COST)]
-                        of_robot.take(message.stamp_ns, value)
+                        row = message.stamp_ns, value
+                        self.robot_cost[figure.removeprefix(_COST)].append(row)
             case _:
                 pass
 
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:
-            self.map_cost.take(fused.stamp_ns, fused.chi2 / fused.dof)
+            self.map_cost.append((fused.stamp_ns, fused.chi2 / fused.dof))
         if self.frames.has(fused.frame) and (fit := self.truth.fit(fused)) is not None:
             of_blocks, of_map = float(fit.nees.mean()) / 2.0, fit.nees_per_dof
-            self.map_nees.take(fused.stamp_ns, of_blocks if of_map is None else of_map)
+            self.map_nees.append((fused.stamp_ns, of_blocks if of_map is None else of_map))
         for member in fused.members:
             waiting = self.unused[member.robot, member.incarnation]
             for sequence in [k for k in waiting if k <= member.sequence]:
@@ -214,22 +199,27 @@ def history(samples: Iterable[Sample]) -> History:
     return History(
         start_ns=span[0],
         end_ns=span[1],
-        innovations={
-            robot: _innovations(found.innovations[robot]) for robot in in_order(found.innovations)
-        },
-        map_nees=found.map_nees.series,
-        map_cost=found.map_cost.series,
-        robot_cost={robot: found.robot_cost[robot].series for robot in in_order(found.robot_cost)},
-        latencies={
-            robot: Latencies(*map(np.array, zip(*found.latencies[robot], strict=True)))
-            for robot in in_order(found.latencies)
-        },
+        innovations=_by_robot(found.innovations, _innovations),
+        map_nees=_series(found.map_nees),
+        map_cost=_series(found.map_cost),
+        robot_cost=_by_robot(found.robot_cost, _series),
+        latencies=_by_robot(found.latencies, lambda of: Latencies(*np.array(of).T)),
         events=tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
     )
 
 
 def _extend(span_ns: tuple[int, int], stamp_ns: int) -> tuple[int, int]:
     return min(span_ns[0], stamp_ns), max(span_ns[1], stamp_ns)
+
+
+def _by_robot(found: Mapping[str, S], convert: Callable[[S], T]) -> dict[str, T]:
+    return {robot: convert(found[robot]) for robot in in_order(found)}
+
+
+def _series(rows: _Rows) -> Series:
+    ordered = sorted(rows, key=itemgetter(0))
+    stamps, values = ([row[k] for row in ordered] for k in (0, 1))
+    return Series(np.array(stamps, np.int64), np.array(values, np.float64))
 
 
 def _innovations(of: Mapping[tuple[int, int], m.Innovation]) -> Innovations:

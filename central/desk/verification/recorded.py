@@ -3,8 +3,8 @@
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache, partial
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import msgspec
@@ -83,7 +83,6 @@ class RecordedOutput:
     message: m.Message
 
 
-@dataclass
 class Recorded:
     """All node inputs and outputs in a log; each measurement once.
 
@@ -91,17 +90,16 @@ class Recorded:
     announced by the source. withdrawals: first order on each robot.
     """
 
-    measurements: dict[Stream, RecordedMeasurements] = field(
-        default_factory=partial(defaultdict, RecordedMeasurements)
-    )
-    configured: dict[str, m.Configuration] = field(default_factory=dict)
-    outputs: dict[str, list[RecordedOutput]] = field(default_factory=partial(defaultdict, list))
-    reported: dict[Stream, int] = field(default_factory=dict)
-    published: dict[Stream, int] = field(default_factory=dict)
-    known_map: m.KnownMap | None = None
-    saved_maps: dict[str, m.SavedMap] = field(default_factory=dict)
-    withdrawals: dict[str, m.Withdrawal] = field(default_factory=dict)
-    unsound: int = 0
+    def __init__(self) -> None:
+        self.measurements: dict[Stream, RecordedMeasurements] = defaultdict(RecordedMeasurements)
+        self.configured: dict[str, m.Configuration] = {}
+        self.outputs: dict[str, list[RecordedOutput]] = defaultdict(list)
+        self.reported: dict[Stream, int] = {}
+        self.published: dict[Stream, int] = {}
+        self.known_map: m.KnownMap | None = None
+        self.saved_maps: dict[str, m.SavedMap] = {}
+        self.withdrawals: dict[str, m.Withdrawal] = {}
+        self.unsound = 0
 
     def take_all(self, samples: Sequence[Sample]) -> None:
         """Index samples in log order."""
@@ -123,10 +121,8 @@ class Recorded:
                 of_a_fold = channel is ch.TEAM_CONFIG
                 self.configured["central" if of_a_fold else message.node] = message
             case m.Progress():
-                consumed = self.reported.get((message.robot, message.incarnation), 0)
-                self.reported[message.robot, message.incarnation] = max(
-                    consumed, message.measurements
-                )
+                stream = (message.robot, message.incarnation)
+                self.reported[stream] = max(self.reported.get(stream, 0), message.measurements)
             case m.KnownMap():
                 self.known_map = message
             case m.SavedMap():
@@ -227,12 +223,8 @@ def identity(key: str, message: m.Message) -> Identity:
     """Message key, and names of inputs."""
     match message:
         case m.Submap():
-            names: Identity = (
-                message.incarnation,
-                message.sequence,
-                message.first_measurement,
-                message.last_measurement,
-            )
+            span = message.first_measurement, message.last_measurement
+            names: Identity = (message.incarnation, message.sequence, *span)
         case m.Association():
             names = (message.incarnation, message.sequence, message.stamps)
         case m.SightingFactor():
@@ -246,13 +238,8 @@ def identity(key: str, message: m.Message) -> Identity:
         case m.Prior() | m.Trajectory():
             names = (message.incarnation, message.digest)
         case m.FusedMap():
-            names = (
-                message.exchange,
-                message.provisional,
-                message.members,
-                message.withdrawn,
-                message.verdicts,
-            )
+            of_set = message.members, message.withdrawn, message.verdicts
+            names = (message.exchange, message.provisional, *of_set)
         case _:
             names = (message.stamp_ns,)
     return (key, *names)

@@ -138,12 +138,12 @@ class PageFrames:
         out, self._out = self._out, []
         return out
 
-    def end(self, notes: Sequence[str] = (), *, complete: bool) -> list[str]:
+    def end(self, notes: Sequence[str] = ()) -> list[str]:
         """Return the last frames; notes: log faults."""
         out = self.flush(self._newest_ns)
         for note in notes:
             self._add_frame("ev", t=self._t(self._newest_ns), e="warning", n="log", x=note)
-        self._add_frame("eof", complete=complete)
+        self._add_frame("eof", complete=True)
         return out + self.flush()
 
     def _add_frame(self, kind: str, **fields: object) -> None:

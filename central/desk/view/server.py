@@ -109,7 +109,7 @@ class Feed:
         if samples:
             self.frames += self._page.flush(self._viewing.node.now_ns)
         elif self.tail.ended or not growing:
-            self.frames += self._page.end(self._faults(), complete=True)
+            self.frames += self._page.end(self._faults())
             self.ended = True
         return bool(samples)
 
