@@ -24,9 +24,8 @@ from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
-from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.models import Increment, increment_of
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.odometry import segmenter_of
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded, encoded
@@ -59,10 +58,10 @@ def compose_directly() -> None:
 
 
 def composed_in_a_run() -> None:
-    segmenter = Segmenter(MOTION, Sensor(), 0.0)
+    segmenter = segmenter_of(MOTION, Sensor(), 0.0)
     segmenter.begin(0)
     for k in range(1, INTERVALS + 1):
-        segmenter.drive(OdometryInterval(k * INTERVAL_NS, INTERVAL_NS, 0.3, 0.1))
+        segmenter.drive(k * INTERVAL_NS, INTERVAL_NS, 0.3, 0.1)
     segmenter.cut(INTERVALS * INTERVAL_NS)
 
 

@@ -36,5 +36,10 @@ class Rejection(StrEnum):
         return f"{REJECTED}{self.value}"
 
 
+BY_CORE = (
+    None, Rejection.NO_TIME, Rejection.OLDER, Rejection.TIME, Rejection.SPEED, Rejection.STEERING,
+    Rejection.RANGE, Rejection.SENSOR_LIMITS,
+)  # fmt: skip
+"""The verdicts of `core.StreamJudge` and `core.Segmenter`, in their order."""
 UNMEASURED = frozenset({None, Rejection.SPEED, Rejection.STEERING})
 """Outcomes of an odometry interval whose time is used."""

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.config import RobotConfig
 from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import (
     NO_OWN,
@@ -20,7 +20,7 @@ from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix
 from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
-from teamslam.team.estimation.scans import Scan, point_scan, polar_scan
+from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
@@ -65,19 +65,14 @@ def scan_of(message: m.AnyScan | m.Detections) -> Scan:
     Detections without identities have the numbers 2³¹ + their index in the message, until their
     window associates them.
     """
-    claimed = None
-    if message.covariances:
-        claimed = floats(message.covariances, "covariances").reshape(-1, 3)
+    own = message.covariances
     match message:
         case m.Observations():
-            seen = ids(message.ids, "ids")
+            return Scan.polar(message.ids, message.ranges, message.bearings, own)
         case m.Points():
-            positions = floats(message.positions, "positions").reshape(-1, 2)
-            return point_scan(ids(message.ids, "ids"), positions, claimed)
+            return Scan.points(message.ids, message.positions, own)
         case m.Detections():
-            seen = np.arange(UNNAMED, UNNAMED + len(message.ranges) // 8, dtype=np.uint32)
-    ranges, bearings = floats(message.ranges, "ranges"), floats(message.bearings, "bearings")
-    return polar_scan(seen, ranges, bearings, claimed)
+            return Scan.unnamed(message.ranges, message.bearings, own)
 
 
 def team_time_of(message: m.Measurement, clock_offset_s: float) -> int:
@@ -101,7 +96,7 @@ def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval
             increment = floats(message.increment, "increment").astype(np.float64)
             motion = moved(increment, covariance if message.covariance else None)
             rates = motion.twist / max(duration_ns * 1e-9, 1e-9)
-            return OdometryInterval(end_ns, duration_ns, float(rates[0]), float(rates[2]), motion)
+            return OdometryInterval(end_ns, duration_ns, float(rates[0]), float(rates[2]), *motion)
 
 
 def detections_of(

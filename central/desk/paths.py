@@ -13,7 +13,7 @@ import numpy as np
 from teamslam.central.desk.verification.recorded import Recorded, RerunError
 from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team import translate
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed, window_path
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch

@@ -22,8 +22,8 @@ from teamslam.team.config import AssociationSettings, RobotConfig
 from teamslam.team.estimation.association.certainty import estimate_view
 from teamslam.team.estimation.association.clustering import Clusters, cluster_window
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, relative_to
-from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
+from teamslam.team.estimation.odometry import segmenter_of
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
 
@@ -70,20 +70,22 @@ def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
     if stream.landmark_detections.hidden is None:
         return []
     front = config.front_end
-    segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s)
+    segmenter = segmenter_of(config.motion, config.sensor, front.keyframe_s)
     window_ns, start_ns = round(front.window_s * 1e9), None
     keyframes, found = [], []
     for message in messages_of(stream):
         if isinstance(message, m.AnyScan | m.Detections):
-            segmenter.observe(message.stamp_ns, *translate.scan_of(message))
+            segmenter.observe(message.stamp_ns, translate.scan_of(message))
         elif isinstance(message, m.AnyOdometry):
             interval = translate.interval_of(message, config)
             if start_ns is None:
                 start_ns = interval.end_ns - interval.duration_ns
                 segmenter.begin(start_ns)
-            keyframes += segmenter.drive(interval)
+            segmenter.integrate(interval, is_measured=True)
+            keyframes += segmenter.take_keyframes()
             if interval.end_ns - start_ns >= window_ns:
-                keyframes += segmenter.cut(interval.end_ns)[0]
+                segmenter.cut(interval.end_ns)
+                keyframes += segmenter.take_keyframes()
                 segmenter.leave()
                 if any(each.looks for each in keyframes):
                     scans = scans_of(events_of(keyframes), config.sensor)

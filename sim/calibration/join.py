@@ -15,9 +15,8 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.hybrid_slam.window import Window
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Window
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,

@@ -11,13 +11,13 @@ from msgspec import structs
 from teamslam.central.config import TeamConfig
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.central.desk.evaluation.results import Evaluation
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.gaussian import Matrix
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from teamslam.team.estimation.models import Increment, noise
 from teamslam.team.estimation.mount import start_of_sensor
+from teamslam.team.estimation.odometry import segmenter_of
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import Pose, between, compose, inverse
 from teamslam.team.shapes import Float, Int64, UInt32
@@ -142,11 +142,11 @@ def _chain(
                 "that"
             )
     first_ns, last_ns = odometry[0].end_ns - odometry[0].duration_ns, odometry[-1].end_ns
-    grid = _grid(config) if sightings else None
-    segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s, grid)
+    segmenter = segmenter_of(config.motion, config.sensor, config.front_end.keyframe_s)
     segmenter.begin(first_ns)
+    grid = _grid(config, segmenter, first_ns) if sightings else None
     start: tuple[Pose | None, Matrix | None] = (None, None)
-    keyframes: list[Keyframe] = []
+    keyframes: list[core.Keyframe] = []
     for measurement in measurements:
         match measurement:
             case m.InitialPose():
@@ -154,35 +154,45 @@ def _chain(
                 if pose is not None:
                     start = start_of_sensor(pose, covariance, np.array(config.sensor.mount))
             case m.Observations() | m.Points():
-                segmenter.observe(measurement.stamp_ns, *translate.scan_of(measurement))
+                segmenter.observe(measurement.stamp_ns, translate.scan_of(measurement))
             case m.Sightings() if grid is not None:
                 grid.observe(
                     measurement.stamp_ns, measurement.number, translate.detections_of(measurement)
                 )
             case m.Odometry() | m.Increment() | m.Steering():
-                keyframes += segmenter.drive(translate.interval_of(measurement, config))
-    last, rest = segmenter.cut(last_ns)
-    keyframes += last
-    if rest.mean.any() or rest.covariance.any():
-        none = np.empty(0)
-        nothing = np.empty(0, np.uint32)
-        keyframes.append(Keyframe(last_ns, rest, nothing, none, none))
+                segmenter.integrate(translate.interval_of(measurement, config), is_measured=True)
+                keyframes += _keyframes(segmenter, grid)
+    rest = segmenter.cut(last_ns)
+    keyframes += segmenter.take_keyframes()
+    if any(part.any() for part in rest.motion):
+        keyframes.append(rest)
     return Chain(
         config=config,
         incarnation=incarnation,
         start=start[0],
         start_covariance=start[1],
         stamps_ns=np.array([first_ns, *(e.stamp_ns for e in keyframes)]),
-        increments=tuple(e.increment for e in keyframes),
-        scans=tuple(Scan(e.ids, e.ranges, e.bearings, e.own) for e in keyframes),
+        increments=tuple(Increment(*e.motion) for e in keyframes),
+        scans=tuple(
+            Scan(e.scan.ids, e.scan.ranges, e.scan.bearings, e.scan.own) for e in keyframes
+        ),
         sightings=() if grid is None else grid.sightings(),
     )
 
 
-def _grid(config: RobotConfig) -> PoseGrid | None:
+def _keyframes(segmenter: core.Segmenter, grid: PoseGrid | None) -> list[core.Keyframe]:
+    if grid is not None:
+        grid.pass_stops()
+    return list(segmenter.take_keyframes())
+
+
+def _grid(config: RobotConfig, segmenter: core.Segmenter, begin_ns: int) -> PoseGrid | None:
     if not config.front_end.node_s:
         return None
-    return PoseGrid(config.sensor, structs.replace(config.front_end, window_s=_ENDLESS_S))
+    front = structs.replace(config.front_end, window_s=_ENDLESS_S)
+    grid = PoseGrid(segmenter, config.sensor, front)
+    grid.begin(begin_ns)
+    return grid
 
 
 def place_chains(

@@ -229,7 +229,9 @@ def landmarks_of(
         for each, scan in zip(unnamed, scans, strict=True)
         for given in (known.get(each.stamp_ns, nothing),)
     ]
-    found = _scans(unnamed, [s._replace(ids=i) for s, i in zip(scans, own, strict=True)])
+    found = _scans(
+        unnamed, [Scan(i, s.ranges, s.bearings, s.own) for s, i in zip(scans, own, strict=True)]
+    )
     signatures = [floats(each.signatures, "signatures") for each in unnamed]
     whole = all(each.signatures for each in unnamed)
     counts = [len(scan.ids) for scan in scans]

@@ -3,7 +3,7 @@ The numerical core: the state of a window, and functions with defined bits.
 """
 
 from collections.abc import Sequence
-from typing import overload
+from typing import Final, overload
 
 import numpy
 from numpy.typing import NDArray
@@ -665,14 +665,6 @@ def place(pose: NDArray[numpy.float64], measurements: NDArray[numpy.float64], no
     noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.
     """
 
-def reduce_scans(scans: Sequence[tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], poses: NDArray[numpy.float64]) -> tuple[NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]:
-    """
-    Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.
-
-    poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
-    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
-    """
-
 class MotionModel:
     """
     The parameters of a motion model, as of `teamslam.team.config.MotionModel`.
@@ -716,65 +708,45 @@ def motion_of_sensor(mean: NDArray[numpy.float64], covariance: NDArray[numpy.flo
     Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).
     """
 
-class Odometry:
+class OdometryInterval:
     """
-    Odometry integrated since the places that matter to a window.
+    An odometry interval until end_ns: mean forward speed [m/s] and yaw rate [rad/s].
 
-    With a mount the motions since a keyframe and a scan are the sensor's; those since a pose node and an
-    inter-robot measurement are the base's. A motion is (mean, covariance).
+    twist: (forward [m], left [m], turn [rad]) of a reported motion Exp(twist), which has these speeds; covariance:
+    reported, of the error in the tangent space of its end.
     """
 
-    def __init__(self, model: MotionModel, mount: Sequence[float] | None) -> None:
-        """
-        mount: the sensor's pose on the base; None where it is at the base's origin.
-        """
+    def __init__(self, end_ns: int, duration_ns: int, forward: float, yaw_rate: float, twist: NDArray[numpy.float64] | None = None, covariance: NDArray[numpy.float64] | None = None) -> None: ...
 
-    def drive(self, duration_s: float, forward: float, yaw_rate: float, added: Sequence[float] | None) -> None:
-        """
-        Integrate a part of an interval whose speeds were measured.
+    @property
+    def end_ns(self) -> int: ...
 
-        added: variances per second, in addition to the noise.
-        """
+    @property
+    def duration_ns(self) -> int: ...
 
-    def move(self, twist: NDArray[numpy.float64], covariance: NDArray[numpy.float64] | None, interval_s: float, duration_s: float, share: float, rest: float, added: Sequence[float] | None) -> None:
-        """
-        Integrate a part of an interval whose motion was measured, as `MotionModel.part`.
-        """
+    @property
+    def forward(self) -> float: ...
 
-    def end_keyframe(self) -> tuple[tuple[NDArray[numpy.float64], NDArray[numpy.float64]], NDArray[numpy.float64], tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None]:
-        """
-        End the motion since the last keyframe here.
+    @property
+    def yaw_rate(self) -> float: ...
 
-        Returns it; its shift (forward, left, turn) by an error of the scale of speed, with its duration [s]; and the
-        motion since the last scan without identities, if there was one.
-        """
+    @property
+    def twist(self) -> NDArray[numpy.float64] | None: ...
 
-    def pass_unnamed_scan(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """
-        Return the motion since the last scan without identities or keyframe, and begin anew here.
-        """
+    @property
+    def covariance(self) -> NDArray[numpy.float64] | None: ...
 
-    def mark_scan(self) -> None:
-        """Mark a scan here, of a keyframe of several scans."""
+    @property
+    def speed(self) -> float:
+        """Magnitude of the velocity [m/s]; without a reported motion, signed."""
 
-    def end_scans(self) -> NDArray[numpy.float64]:
+    def gone_on(self, end_ns: int, duration_ns: int) -> OdometryInterval:
+        """Extrapolate to a later interval at the same speeds."""
+
+    def part(self, model: MotionModel, duration_ns: int, rest_ns: int) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
         """
-        Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.
+        Compute the motion of a part of the interval, rest_ns before its end, as `MotionModel.part`.
         """
-
-    def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """The motion since the last pose node."""
-
-    def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
-        """
-        Begin the motion since the last pose node here; return the motions since the marked sightings, and forget these.
-        """
-
-    def mark_sighting(self) -> None:
-        """Mark an inter-robot measurement here, for the next pose node."""
-
-    def forget_sightings(self) -> None:
-        """Forget the marked sightings."""
 
 def compose(a_from_b: NDArray[numpy.float64], b_from_c: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """a_from_c = a_from_b o b_from_c, or that of each row of b_from_c."""
@@ -1135,47 +1107,322 @@ class Window:
     def keyframes(self) -> int:
         """Number of keyframes."""
 
+class Scan:
+    """
+    Measurements of landmarks: ids, ranges [m] and bearings [rad], relative to the sensor.
+    """
+
+    def __init__(self, ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64] | None = None) -> None:
+        """
+        own: (n, 4) covariances that the measurements bring, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.
+        """
+
+    @staticmethod
+    def polar(ids: bytes, ranges: bytes, bearings: bytes, covariances: bytes = ...) -> Scan:
+        """
+        Make a scan of a message's bytes; covariances: (rr, rb, bb) of each, or empty.
+        """
+
+    @staticmethod
+    def points(ids: bytes, positions: bytes, covariances: bytes = ...) -> Scan:
+        """
+        Make a scan of points (x, y) in the sensor's frame; covariances: (xx, xy, yy) of each, or empty.
+
+        (r, b) = (|p|, atan2(y, x)) and J S J' with J = d(r, b)/dp.
+        """
+
+    @staticmethod
+    def unnamed(ranges: bytes, bearings: bytes, covariances: bytes = ...) -> Scan:
+        """Make a scan of landmarks without identities, numbered from 2^31 on."""
+
+    @property
+    def ids(self) -> NDArray[numpy.uint32]: ...
+
+    @property
+    def ranges(self) -> NDArray[numpy.float64]: ...
+
+    @property
+    def bearings(self) -> NDArray[numpy.float64]: ...
+
+    @property
+    def own(self) -> NDArray[numpy.float64]:
+        """
+        Covariances (n, 4) that the measurements bring, (n, 0) where they bring none.
+        """
+
+    @property
+    def is_unnamed(self) -> bool:
+        """Whether the landmarks have no identities."""
+
+    def __len__(self) -> int: ...
+
+    def only(self, taken: NDArray[numpy.bool_]) -> Scan:
+        """Select measurements."""
+
+    def together(self, more: Scan) -> Scan:
+        """
+        Append further measurements; where only one part brings covariances, the others have the sensor's noise.
+        """
+
+def reduce_scans(scans: Sequence[Scan], poses: NDArray[numpy.float64]) -> Scan:
+    """
+    Reduce scans to one measurement per landmark, by ascending id.
+
+    poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
+    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
+    """
+
+class TimedScan:
+    """
+    A scan without identities, at at_ns: its stamp, or the start of the odometry that covers it.
+    """
+
+    def __init__(self, stamp_ns: int, scan: Scan, at_ns: int, motion: tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None) -> None: ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def at_ns(self) -> int: ...
+
+    @property
+    def scan(self) -> Scan: ...
+
+    @property
+    def motion(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None:
+        """Motion since the scan or keyframe before."""
+
+    @property
+    def back(self) -> NDArray[numpy.float64] | None:
+        """Pose relative to the keyframe's end, if that is another."""
+
+class Keyframe:
+    """
+    The sensor's motion since the last keyframe, and the measurements at its end, accepted and calibrated.
+
+    looks: the scans without identities since the last keyframe; rest: the motion since the last of them. is_node:
+    the pose is a pose node of the submap. shift: of the motion, (forward, left, turn), by an error of the scale of
+    speed, and the motion's duration [s]. A motion is (mean, covariance).
+    """
+
+    def __init__(self, stamp_ns: int, motion: tuple[NDArray[numpy.float64], NDArray[numpy.float64]], scan: Scan | None = None, looks: Sequence[TimedScan] = [], rest: tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None = None, is_node: bool = False, shift: Sequence[float] = [0.0, 0.0, 0.0, 0.0]) -> None: ...
+
+    @property
+    def stamp_ns(self) -> int: ...
+
+    @property
+    def motion(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]: ...
+
+    @property
+    def scan(self) -> Scan: ...
+
+    @property
+    def looks(self) -> list[TimedScan]: ...
+
+    @property
+    def rest(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]] | None: ...
+
+    @property
+    def is_node(self) -> bool: ...
+
+    @property
+    def shift(self) -> list[float]: ...
+
+class StreamBounds:
+    """Bounds of a sensor stream, as of `teamslam.team.config.Bounds`."""
+
+    def __init__(self, jump_ns: int, interval_s: float, speed_m_s: float, yaw_rate_rad_s: float, extent_m: float, sigma_m: Sequence[float], sigma_rad: Sequence[float]) -> None: ...
+
+class StreamJudge:
+    """
+    Checks one incarnation of a sensor stream against the time of its last odometry.
+
+    A stamp `jump_ns` ahead of the odometry is refused, even of odometry, until the next interval confirms that the
+    clock has jumped. A verdict is an index of `teamslam.team.rejection.BY_CORE`.
+    """
+
+    def __init__(self, bounds: StreamBounds) -> None: ...
+
+    def judge(self, interval: OdometryInterval) -> int:
+        """Judge an interval; for SPEED and STEERING only its motion is refused."""
+
+    def is_ahead(self, stamp_ns: int) -> bool:
+        """Whether a measurement is too far ahead of the odometry."""
+
+    def judge_scan(self, stamp_ns: int, scan: Scan) -> int:
+        """Judge a scan, and drop its measurements beyond the bounds."""
+
+class Segmenter:
+    """
+    Integrates odometry between keyframes; an observation splits an interval.
+
+    With keyframe_ns = 0 every scan is a keyframe. Otherwise the scans within keyframe_ns are reduced to the
+    median range and bearing per landmark, moved by the odometry to the end of the interval that closes the
+    keyframe. Each pose node is a keyframe without measurements. Scans without identities are kept until the
+    window's end. Motions are the sensor's; those since a pose node and an inter-robot measurement are the base's.
+    A verdict is an index of `teamslam.team.rejection.BY_CORE`.
+    """
+
+    def __init__(self, model: MotionModel, mount: NDArray[numpy.float64] | None, calibration: Calibration, covariance_factor: float, keyframe_ns: int, window_ns: int, bounds: StreamBounds) -> None:
+        """
+        mount: the sensor's pose on the base; None where it is at the base's origin. covariance_factor: on the
+        covariances that measurements bring. window_ns: planned length of a window.
+        """
+
+    def begin(self, stamp_ns: int) -> None:
+        """Begin a stream or a window at this team time."""
+
+    def resume(self, stamp_ns: int) -> None:
+        """Begin behind a window whose odometry ended at this team time."""
+
+    def observe(self, stamp_ns: int, scan: Scan) -> int:
+        """Keep a scan until the odometry covers its time; return the verdict."""
+
+    @overload
+    def drive(self, end_ns: int, duration_ns: int, forward: float, yaw_rate: float) -> int: ...
+
+    @overload
+    def drive(self, interval: OdometryInterval) -> int:
+        """
+        Judge and integrate an odometry interval.
+
+        Returns the verdict, plus DUE where keyframes are made, the window has lasted for window_ns, or the odometry
+        stops at `stop_at`.
+        """
+
+    def integrate(self, interval: OdometryInterval, is_measured: bool) -> int:
+        """
+        Integrate an interval past the judge; returns DUE or 0.
+
+        An unmeasured motion has the last speeds, with standard deviations as large as the motion, at least 1 m/s and
+        0.5 rad/s, and below a full rotation in heading.
+        """
+
+    def stop_at(self, stop_ns: int) -> None:
+        """
+        Stop the odometry at this team time, before the scans there, until `go_on`; 2^62: never.
+        """
+
+    def go_on(self) -> int:
+        """Integrate the rest of the interval; returns DUE or 0."""
+
+    def take_keyframes(self) -> list[Keyframe]:
+        """Remove and return the keyframes made."""
+
+    def cut(self, stamp_ns: int) -> Keyframe:
+        """
+        Close the window: make its last keyframe; return the later motion, as a keyframe without measurements.
+        """
+
+    def leave(self) -> int:
+        """
+        Drop the scans stamped behind the window; return their number.
+
+        Their counters lie in the window's interval of measurements: a robot restarted behind it would lack them.
+        """
+
+    def mark_sighting(self) -> None:
+        """Mark an inter-robot measurement here, for the next pose node."""
+
+    def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """The motion since the last pose node."""
+
+    def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
+        """
+        Make the stop a pose node; return the motions since the marked sightings, and forget these.
+        """
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether the odometry has stopped within the interval."""
+
+    @property
+    def interval(self) -> OdometryInterval:
+        """The present interval; of an unmeasured motion, with the last speeds."""
+
+    @property
+    def judge(self) -> StreamJudge: ...
+
+    @property
+    def uncovered(self) -> int:
+        """Number of scans that wait for odometry to cover their time."""
+
+    @property
+    def start_ns(self) -> int | None:
+        """Begin of the window; None before the stream's."""
+
+    @property
+    def now_ns(self) -> int | None:
+        """End of the odometry; None before the stream's begin."""
+
+    @property
+    def driven_m(self) -> float:
+        """Path length [m] since the window's start."""
+
+    DUE: Final[int] = ...
+    """(arg: object, /) -> int"""
+
 class OpenWindow:
     """
-    A window while it is open: its particles behind a gate against outliers, and their random numbers.
+    A window while it is open: its keyframes, and its particles behind a gate against outliers, with their random
+    numbers. A motion or measurement that is not finite leaves it without a solution.
     """
 
-    def __init__(self, particles: int, noise: Sequence[float], improved: bool, mount: Sequence[float], resample_below: float, max_range: float, field_of_view: float, outlier_share: float, random: Random) -> None:
+    def __init__(self, particles: int, noise: Sequence[float], improved: bool, mount: Sequence[float], resample_below: float, max_range: float, field_of_view: float, outlier_share: float, random: Random, most_landmarks: int) -> None:
         """
-        Open a window: arguments as of `Window` and `Consensus`. random: copied, where it is.
+        Open a window: arguments as of `Window` and `Consensus`. random: copied, where it is. most_landmarks: beyond them
+        the farthest new landmarks of a keyframe are dropped.
         """
 
-    def admit(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], node_ns: int | None = None) -> bool:
+    def advance(self, keyframe: Keyframe) -> None:
         """
         Take a keyframe with those of its measurements that agree with others of the window so far.
 
-        node_ns: the team time, where the keyframe is a pose node. Other arguments are as of `Window.advance`.
-        Returns False, and leaves the particles as they are, if a measurement that was accepted before no longer
-        agrees: restart with `begin` and the accepted measurements of all keyframes. Raises MotionError.
+        If a measurement that was accepted before no longer agrees, the window is computed again.
         """
 
-    def take(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], node_ns: int | None = None) -> None:
-        """
-        Take a keyframe past the gate; arguments as of `admit`. Raises MotionError.
-        """
+    def advance_by(self, segmenter: Segmenter) -> None:
+        """Take the keyframes that a segmenter has made."""
 
-    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], shift: NDArray[numpy.float64]) -> None:
-        """Move the particles without a keyframe, as `Window.move`."""
+    def move(self, rest: Keyframe) -> None:
+        """Move the particles by the motion after the last keyframe."""
 
     def confirm(self) -> bool:
         """
         Compare all measurements of the window; return whether others are accepted now.
         """
 
-    def accepted(self, keyframe: int) -> NDArray[numpy.bool_] | None:
+    def accepted(self) -> list[Keyframe]:
+        """Copy the keyframes with their accepted measurements."""
+
+    def restart(self, keyframes: Sequence[Keyframe], particles: int) -> None:
         """
-        Mark the accepted measurements of an admitted keyframe; None where they all are.
+        Compute the window again with these keyframes, so many particles and the first random numbers; the gate stays.
+
+        Raises MotionError.
         """
 
-    def begin(self, particles: int) -> None:
-        """
-        Restart with so many particles and the first random number; the gate stays.
-        """
+    def give_up(self) -> None:
+        """Leave the window without a solution."""
+
+    def base_motion(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """Compute the base's motion by odometry alone."""
+
+    @property
+    def is_solvable(self) -> bool:
+        """Whether no motion and no measurement was refused."""
+
+    @property
+    def keyframes_ns(self) -> NDArray[numpy.int64]:
+        """Team time [ns] of each keyframe."""
+
+    @property
+    def last_keyframe_ns(self) -> int | None:
+        """Team time [ns] of the last keyframe; None without any."""
+
+    @property
+    def has_unnamed(self) -> bool:
+        """Whether a keyframe has scans without identities."""
 
     @property
     def window(self) -> Window:
@@ -1188,6 +1435,10 @@ class OpenWindow:
     @property
     def rejected(self) -> int:
         """Number of measurements that are not accepted."""
+
+    @property
+    def restarts(self) -> int:
+        """Number of times that the window was computed again."""
 
     @property
     def least_effective(self) -> float:

@@ -10,17 +10,12 @@ from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
 from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.se2 import Pose, compose, inverse
+from teamslam.team.estimation.se2 import Pose, compose
 
 
 def of_sensor(step: Increment, mount: Pose) -> Increment:
     """Convert a motion of the base to the sensor's: T Exp(ξ) m = m (m⁻¹ T m) Exp(Ad(m⁻¹) ξ)."""
     return Increment(*core.motion_of_sensor(step.mean, step.covariance, mount))
-
-
-def of_base(step: Increment, mount: Pose) -> Increment:
-    """Convert a motion of the sensor to the base's."""
-    return of_sensor(step, inverse(mount))
 
 
 def start_of_sensor(

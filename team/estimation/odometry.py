@@ -1,17 +1,28 @@
-"""An interval of odometry, and any part of it, as a Gaussian on SE(2)."""
+"""Odometry of a robot as the core takes it, and the bounds of its stream."""
 
 import math
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
-from msgspec.structs import replace
 
 from teamslam.team import core
-from teamslam.team.config import MotionModel
-from teamslam.team.estimation.models import Increment, increment_of, model_of
+from teamslam.team.config import Bounds, MotionModel, Sensor
+from teamslam.team.core import OdometryInterval
+from teamslam.team.estimation.models import calibration_of, model_of
 from teamslam.team.estimation.se2 import Pose, logarithm
 from teamslam.team.shapes import Float
+
+__all__ = ["LONGEST_NS", "Moved", "OdometryInterval", "moved", "nanoseconds", "segmenter_of",
+           "steered", "stream_bounds"]  # fmt: skip
+
+LONGEST_NS = 2**62
+"""No two stamps are as far apart."""
+_BOUNDS = Bounds()
+
+
+def nanoseconds(seconds: float) -> int:
+    """Convert a configured duration to ns, bounded by the span of stamps."""
+    return min(round(seconds * 1e9), LONGEST_NS)
 
 
 class Moved(NamedTuple):
@@ -24,44 +35,36 @@ class Moved(NamedTuple):
     covariance: Float[np.ndarray, "3 3"] | None = None
 
 
-class OdometryInterval(msgspec.Struct, frozen=True, gc=False):
-    """An odometry interval until end_ns: mean forward speed [m/s] and yaw rate [rad/s].
-
-    moved: a reported motion, whose twist gives the speeds.
-    """
-
-    end_ns: int
-    duration_ns: int
-    forward: float
-    yaw_rate: float
-    moved: Moved | None = None
-
-    def part(self, motion: MotionModel, duration_ns: int, rest_ns: int) -> Increment:
-        """Compute the motion of a part of the interval, rest_ns before its end."""
-        if self.moved is None:
-            return increment_of(motion, duration_ns * 1e-9, self.forward, self.yaw_rate)
-        share, rest = duration_ns / self.duration_ns, rest_ns / self.duration_ns
-        interval_s = self.duration_ns * 1e-9
-        return Increment(*model_of(motion).part(*self.moved, interval_s, share, rest))
-
-    def gone_on(self, end_ns: int, duration_ns: int) -> "OdometryInterval":
-        """Extrapolate to a later interval at the same speeds."""
-        if self.moved is None:
-            return replace(self, end_ns=end_ns, duration_ns=duration_ns)
-        twist = self.moved.twist * (duration_ns / self.duration_ns)
-        return replace(self, end_ns=end_ns, duration_ns=duration_ns, moved=Moved(twist))
-
-    @property
-    def speed(self) -> float:
-        """Magnitude of the velocity [m/s]; without a reported motion, signed."""
-        if self.moved is None:
-            return self.forward
-        forward, left, _ = self.moved.twist.tolist()
-        return core.hypot(float(forward), float(left)) / (self.duration_ns * 1e-9)
+def segmenter_of(
+    motion: MotionModel,
+    sensor: Sensor,
+    keyframe_s: float,
+    window_s: float | None = None,
+    bounds: Bounds = _BOUNDS,
+) -> core.Segmenter:
+    """Make the segmenter of a robot's stream; window_s: of a stream with windows."""
+    return core.Segmenter(
+        model_of(motion),
+        np.array(sensor.mount) if sensor.is_mounted else None,
+        calibration_of(sensor),
+        sensor.covariance_factor,
+        nanoseconds(keyframe_s),
+        LONGEST_NS if window_s is None else nanoseconds(window_s),
+        stream_bounds(bounds),
+    )
 
 
-STANDING = OdometryInterval(0, 1, 0.0, 0.0)
-"""The interval assumed before the first measurement."""
+def stream_bounds(bounds: Bounds) -> core.StreamBounds:
+    """Convert the bounds of a sensor stream to the core's."""
+    return core.StreamBounds(
+        nanoseconds(bounds.jump_s),
+        bounds.interval_s,
+        bounds.speed_m_s,
+        bounds.yaw_rate_rad_s,
+        bounds.extent_m,
+        bounds.sigma_m,
+        bounds.sigma_rad,
+    )
 
 
 def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:

@@ -90,12 +90,6 @@ def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None
     return why
 
 
-def is_motion_spread(covariance: Matrix, bounds: Bounds) -> bool:
-    """Whether the covariance of a motion on SE(2) is within the bounds."""
-    most = np.array([bounds.sigma_m[1], bounds.sigma_m[1], bounds.sigma_rad[1]])
-    return bool((np.sqrt(np.diag(covariance)) <= most).all())
-
-
 def _far(coordinates: Values, limit_m: float, of: str) -> str | None:
     farthest = core.largest(coordinates)
     if farthest <= limit_m:

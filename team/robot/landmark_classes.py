@@ -7,7 +7,7 @@ import numpy as np
 
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.estimation.submap import Became
 from teamslam.team.wire import messages as m
 

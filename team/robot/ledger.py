@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.rejection import Rejection
 from teamslam.team.wire import messages as m
 

@@ -16,21 +16,18 @@ from teamslam.team import core, translate
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.door import another_time
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.hybrid_slam.pipeline import DUE, HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
-from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindow
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Innovation, RunningWindow
 from teamslam.team.estimation.plausibility import start_beyond
-from teamslam.team.estimation.scans import Scan, sensible
+from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap, Slipped
-from teamslam.team.rejection import UNMEASURED, Rejection
+from teamslam.team.rejection import BY_CORE, Rejection
 from teamslam.team.robot.landmark_classes import classify_landmarks
 from teamslam.team.robot.ledger import Ledger, OnDisposition
 from teamslam.team.robot.maps import AT_ORIGIN, InitialPose, OwnMap, thin_out
 from teamslam.team.robot.poses import RunningPoses
 from teamslam.team.robot.statements import MessageWriter
-from teamslam.team.robot.stream import StreamJudge
 from teamslam.team.robot.submaps import Submaps
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
@@ -75,6 +72,7 @@ class Mapper:
         self._replaced, self._on_window = replaced, on_window
         self._on_disposition = on_disposition
         self._period_ns = round(config.pose_s * 1e9)
+        self._offset_ns = round(config.clock_offset_s * 1e9)
         self.gated = 0
         self.now_ns = self.passed_ns = 0
         self._began_ns = 0
@@ -97,7 +95,6 @@ class Mapper:
 
     def _restart(self, incarnation: int, initial: InitialPose) -> None:
         self.ledger = Ledger(self.used, on_disposition=self._on_disposition)
-        self._judge = StreamJudge(self.config.bounds)
         self._taking: m.Measurement | None = None
         self.forget_window()
         self.restart_estimator(incarnation, initial)
@@ -150,7 +147,7 @@ class Mapper:
         self.account(measurement, self._observe(measurement))
         return False
 
-    def _note_time(self, stamp_ns: int, passed_ns: int) -> bool:
+    def note_time(self, stamp_ns: int, passed_ns: int) -> bool:
         """Note a measurement's team time and the time that has passed with it.
 
         False after a clock leap beyond the stamps that receivers take.
@@ -171,11 +168,14 @@ class Mapper:
 
     def drive(self, measurement: m.AnyOdometry) -> bool:
         """Take an odometry interval; return whether it closed the window."""
-        before_ns = self._slam.last_keyframe_ns
-        interval, rejected = self.judge_interval(measurement)
-        closed = None
-        if interval is not None:
-            closed = self._slam.drive(interval, measured=rejected is None)
+        outcome = self._drive(measurement)
+        if not outcome:  # most intervals
+            self.account(measurement, None)
+            return False
+        rejected = BY_CORE[outcome % DUE]
+        before_ns, closed = self._slam.last_keyframe_ns, None
+        if outcome >= DUE:
+            closed = self._slam.advance()
         if closed is not None:
             self._close(closed, measurement, rejected)
             return True
@@ -185,17 +185,16 @@ class Mapper:
             self.out += self.poses.publish(keyframe_ns, self)
         return False
 
-    def judge_interval(
-        self, measurement: m.AnyOdometry
-    ) -> tuple[OdometryInterval | None, Rejection | None]:
-        """The interval of an odometry message, and the reason if it, or only its motion, is
-        rejected; then its time is still used.
-        """
-        interval = translate.interval_of(measurement, self.config)
-        if not self._note_time(interval.end_ns, interval.end_ns):
-            return None, Rejection.TIME
-        rejected = self._judge.odometry(interval)
-        return interval if rejected in UNMEASURED else None, rejected
+    def _drive(self, measurement: m.AnyOdometry) -> int:
+        """Judge and integrate an odometry interval; returns as `core.Segmenter.drive`."""
+        end_ns = measurement.stamp_ns + self._offset_ns
+        if not self.note_time(end_ns, end_ns):
+            return BY_CORE.index(Rejection.TIME)
+        drive = self._slam.segmenter.drive
+        if type(measurement) is m.Odometry:
+            duration_ns = measurement.duration_ns
+            return drive(end_ns, duration_ns, measurement.forward, measurement.yaw_rate)
+        return drive(translate.interval_of(measurement, self.config))
 
     def _observe(self, measurement: m.Measurement) -> Rejection | None:
         """Take a scan or an initial pose, or return the reason to reject it.
@@ -203,8 +202,9 @@ class Mapper:
         A scan precedes the odometry of its stamp, which may end a window.
         """
         stamp_ns = measurement.stamp_ns
-        is_near = self._note_time(stamp_ns, stamp_ns - 1)
-        beyond = self._judge.time(stamp_ns) if is_near else Rejection.TIME
+        is_near = self.note_time(stamp_ns, stamp_ns - 1)
+        is_beyond = not is_near or self.judge.is_ahead(stamp_ns)
+        beyond = Rejection.TIME if is_beyond else None
         match measurement:
             case m.Observations() | m.Points() | m.Detections():
                 return self._observe_landmarks(measurement, beyond)
@@ -222,22 +222,14 @@ class Mapper:
             return Rejection.NO_ASSOCIATION
         if beyond is not None:
             return beyond
-        scan, bounds = translate.scan_of(measurement), self.config.bounds
-        if scan.own.size or not core.largest(scan.ranges) <= bounds.extent_m:
-            near = self._judge.near(scan.ranges)
-            if scan.own.size:
-                near &= sensible(scan.own, scan.ranges, bounds)
-            if not near.any():
-                return Rejection.RANGE
-            scan = scan.only(near)
-        return self.observe(measurement.stamp_ns, scan)
+        return self.observe(measurement.stamp_ns, translate.scan_of(measurement))
 
     def _observe_teammates(
         self, measurement: m.Sightings, rejected: Rejection | None
     ) -> Rejection | None:
         teammates, ranges, bearings = translate.detections_of(measurement)
         others = np.array([name != self.config.id for name in teammates], dtype=np.bool_)
-        near = self._judge.near(ranges) & others
+        near = (ranges <= self.config.bounds.extent_m) & others
         if rejected is None and len(near) and not near.any():
             rejected = Rejection.RANGE if others.any() else Rejection.ITSELF
         if rejected is not None:
@@ -271,7 +263,6 @@ class Mapper:
         self.warnings += [_describe_slip(slip) for slip in closed.slips]
         self.out += self.submaps.close(factors, submap)
         self.forget_window()
-        self._judge = StreamJudge(self.config.bounds, closed.end_ns)
         self.gated += closed.gated
         self._on_window(closed)
         self.own_map.join(closed.local)
@@ -326,9 +317,8 @@ class Mapper:
         for measurement in self._window:
             self.note_input(measurement.number)
             if isinstance(measurement, m.AnyOdometry):
-                interval, rejected = self.judge_interval(measurement)
-                if interval is not None:
-                    self._slam.drive(interval, measured=rejected is None)
+                if self._drive(measurement) >= DUE:
+                    self._slam.advance()
             else:
                 self._observe(measurement)
 
@@ -339,9 +329,13 @@ class Mapper:
             self.note_input(0)
         else:
             self._slam.resume(last.sequence, last.last_measurement, last.stamp_ns)
-        self._judge = StreamJudge(self.config.bounds, None if last is None else last.stamp_ns)
 
     # The estimator.
+
+    @property
+    def judge(self) -> core.StreamJudge:
+        """Checks the stream's times."""
+        return self._slam.segmenter.judge
 
     def note_input(self, number: int) -> None:
         """Note a measurement, even a rejected one, as the open window's input."""

@@ -19,7 +19,7 @@ import msgspec
 from teamslam.team import translate
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.door import absurd
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.pairs import COMPARISON_ROBOT, PAIRS
 from teamslam.team.registry import load
 from teamslam.team.robot.ledger import Ledger, OnDisposition
@@ -54,13 +54,6 @@ class StreamAccount:
         """Begin an incarnation, or continue an earlier process's."""
         self.incarnation, self.consumed = incarnation, consumed
         self.acknowledged, self.steps = acknowledged, 0
-
-    def count(self, measurement: m.Measurement) -> None:
-        """Count a measurement that is consumed next."""
-        self.consumed = measurement.number + 1
-        if m.is_odometry(measurement):
-            self.steps += 1
-            self.all_steps += 1
 
     def acknowledge(self, progress: m.Progress) -> None:
         """Note the number of submaps that the centre has."""
@@ -233,10 +226,12 @@ class RobotNode:
 
     def handle(self, message: m.Message) -> list[Outgoing]:
         """Process one message; its stamp is the time."""
-        if m.is_measurement(message):
-            self.inbox.put(message)
-        else:
+        if not m.is_measurement(message):
             self.receive(message)
+        elif not self.is_held and self.inbox.take(message):
+            self._consume(message)
+        else:
+            self.inbox.put(message)
         self.consume()
         return self._publish() if self.out else []
 
@@ -302,13 +297,17 @@ class RobotNode:
             self._leave_incarnation()
             self.mapper.begin(measurement)
             self.account.begin(measurement.incarnation)
-        self.account.count(measurement)
+        account = self.account
+        account.consumed = measurement.number + 1
+        if m.is_odometry(measurement):
+            account.steps += 1
+            account.all_steps += 1
         if self.mapper.take(measurement):
             self.report_progress()
         if type(measurement) is m.Sightings:
             self._release(measurement.teammates)
-        self.account.unreported += 1
-        if self.account.unreported >= PROGRESS_MEASUREMENTS:
+        account.unreported += 1
+        if account.unreported >= PROGRESS_MEASUREMENTS:
             self.report_progress()
 
     def _publish(self) -> list[Outgoing]:

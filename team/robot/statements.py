@@ -10,9 +10,8 @@ from teamslam.team import core, translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.core import packed
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
-from teamslam.team.estimation.hybrid_slam.window import Innovation
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Innovation
 from teamslam.team.estimation.submap import Became
 from teamslam.team.robot.maps import Cloud
 from teamslam.team.wire import channels as ch

@@ -1,15 +1,13 @@
-"""A robot's sensor stream: the order of its measurements, their plausibility, and its end."""
+"""A robot's sensor stream: the order of its measurements, and its end."""
 
-import math
-
-import numpy as np
-
-from teamslam.team.config import Bounds
-from teamslam.team.door import MOST_COUNT, MOST_LIVES, absurd, another_time
-from teamslam.team.estimation.odometry import OdometryInterval
-from teamslam.team.estimation.plausibility import is_motion_spread
-from teamslam.team.rejection import Rejection
-from teamslam.team.shapes import Bool, Float
+from teamslam.team.door import (
+    EARLY_NS,
+    LATE_NS,
+    MOST_COUNT,
+    MOST_LIVES,
+    absurd,
+    another_time,
+)
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.message_order import later_head, merge_ends
@@ -69,6 +67,7 @@ class Inbox:
         Incarnations follow one another and begin with their only initial pose, the earliest stamp.
         """
         number, incarnation = measurement.number, measurement.incarnation
+        began_ns = self._began_ns
         if incarnation > MOST_LIVES or number > MOST_COUNT:
             return absurd(measurement)
         if (type(measurement) is m.InitialPose) != (number == 0):
@@ -78,9 +77,9 @@ class Inbox:
             if self.next_measurement and incarnation > self.incarnation + NEAR_LIVES:
                 return f"of incarnation {incarnation}, while {self.incarnation} is in progress"
             return None
-        if self._began_ns is None or number in self._of_source:
+        if began_ns is None or -EARLY_NS <= measurement.stamp_ns - began_ns <= LATE_NS:
             return None
-        return another_time(measurement.stamp_ns, self._began_ns)
+        return None if number in self._of_source else another_time(measurement.stamp_ns, began_ns)
 
     def contradicts(self, end: m.End, robot: str) -> str | None:
         """Why an announced end contradicts the stream."""
@@ -98,6 +97,21 @@ class Inbox:
                 f"{self.next_measurement}"
             )
         return None
+
+    def take(self, measurement: m.Measurement) -> bool:
+        """Take a measurement whose turn it is, as most are; False: it must wait (`put`)."""
+        number = measurement.number
+        if (
+            number != self.next_measurement
+            or not number
+            or measurement.incarnation != self.incarnation
+            or self.ahead
+        ):
+            return False
+        self.next_measurement = number + 1
+        if self._of_source:
+            self._of_source.discard(number)
+        return True
 
     def take_next(self) -> m.Measurement | None:
         """Remove and return the measurement whose turn has come."""
@@ -180,61 +194,6 @@ class Inbox:
         while first in later:
             first += 1
         return first
-
-
-class StreamJudge:
-    """Checks one incarnation of a sensor stream against the time of its last odometry.
-
-    A stamp `jump_s` ahead of the odometry is refused, even of odometry, until the next interval
-    confirms that the clock has jumped.
-    """
-
-    def __init__(self, bounds: Bounds, now_ns: int | None = None) -> None:
-        self._bounds = bounds
-        self._jump_ns = round(bounds.jump_s * 1e9)
-        self._longest_ns = bounds.interval_s * 1e9
-        self._now_ns = now_ns
-        self._jumped_ns: int | None = None
-
-    def odometry(self, interval: OdometryInterval) -> Rejection | None:
-        """Return why an interval is refused: for `Rejection.SPEED` only its motion is."""
-        stamp_ns, duration_ns, moved = interval.end_ns, interval.duration_ns, interval.moved
-        if duration_ns == 0:
-            return Rejection.NO_TIME
-        if self._now_ns is not None:
-            ahead_ns = stamp_ns - self._now_ns
-            if ahead_ns <= 0:
-                return Rejection.OLDER
-            if ahead_ns > self._jump_ns:
-                near_ns = self._now_ns if self._jumped_ns is None else self._jumped_ns
-                if not 0 < stamp_ns - near_ns <= self._jump_ns:
-                    self._jumped_ns = stamp_ns
-                    return Rejection.TIME
-        self._now_ns, self._jumped_ns = stamp_ns, None
-        if math.isnan(interval.forward):
-            return Rejection.STEERING
-        bounds = self._bounds
-        sensible = (
-            duration_ns <= self._longest_ns
-            and abs(interval.speed) <= bounds.speed_m_s
-            and abs(interval.yaw_rate) <= bounds.yaw_rate_rad_s
-            and (
-                moved is None
-                or moved.covariance is None
-                or is_motion_spread(moved.covariance, bounds)
-            )
-        )
-        return None if sensible else Rejection.SPEED
-
-    def time(self, stamp_ns: int) -> Rejection | None:
-        """Return why a measurement at this time is refused."""
-        is_ahead = self._now_ns is not None and stamp_ns - self._now_ns > self._jump_ns
-        return Rejection.TIME if is_ahead else None
-
-    def near(self, ranges: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Mask the ranges within the bounds."""
-        within: Bool[np.ndarray, " n"] = ranges <= self._bounds.extent_m
-        return within
 
 
 class EndOfStream:

@@ -1,8 +1,6 @@
 // Hash of odometry, reduced scans and h by angles: one number for every compiler and processor, as bits.cpp.
 #include "bits.hpp"
-#include "calibration.hpp"
-#include "odometry.hpp"
-#include "reduction.hpp"
+#include "segmenter.hpp"
 
 using namespace teamslam;
 
@@ -81,7 +79,7 @@ void run_scans(bool with_claims) {
     if (with_claims && k % 2) scans.back().claims = part(claims);
     poses.push_back({centred(), centred(), 7.0 * centred()});
   }
-  const window::Reduced found = window::reduce(scans, poses);
+  const window::Measurements found = window::reduce(scans, poses);
   for (std::size_t k = 0; k < found.ids.size(); k++) {
     add(double(found.ids[k])), add(found.ranges[k]), add(found.bearings[k]);
     if (with_claims)

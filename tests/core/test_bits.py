@@ -32,7 +32,7 @@ PROGRAMS = {
         ("own_map", "chain", "submap_factor", "dense", "gaussian"),
     ),
     "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
-    "bits_odometry": ("fba0d664d0eb528d", ("motion", "odometry", "reduction")),
+    "bits_odometry": ("fba0d664d0eb528d", ("motion", "segmenter", "measurements")),
 }
 """Hashes of all results of a program in this folder, and the core's sources that it takes."""
 EXACT = ("-std=c++20", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi")

@@ -77,7 +77,15 @@ EXAMPLES = {
     **dict.fromkeys(("landmarks", "measurements"), ROWS.copy),
     "poses": lambda: np.zeros((4, 3)),
     "reduce_scans.poses": lambda: np.zeros((1, 3)),
-    "scans": lambda: [(IDS, POINT.__abs__(), POINT.copy(), NO_CLAIMS)],
+    "scans": lambda: [made("Scan")],
+    **dict.fromkeys(("scan", "more"), lambda: made("Scan")),
+    "taken": lambda: np.array([True, False]),
+    **{
+        f"Scan.{form}.{each}": lambda n=n: b"12345678" * n
+        for form in ("polar", "points", "unnamed")
+        for each, n in (("ranges", 2), ("bearings", 2), ("positions", 4), ("covariances", 6))
+    },
+    **{f"Scan.{form}.ids": IDS.tobytes for form in ("polar", "points")},
     **{f"{each}.mean": MEAN.copy for each in ("WholeMap", "WholeMap.joined")},
     **{f"{each}.mean": MEAN.copy for each in ("Chain.append", "corrected", "SubmapFactor")},
     **{
@@ -164,9 +172,6 @@ EXAMPLES = {
         for each in (
             "Window.advance",
             "Window.move",
-            "OpenWindow.admit",
-            "OpenWindow.take",
-            "OpenWindow.move",
         )
     },
     "means": MEANS.copy,
@@ -185,9 +190,26 @@ EXAMPLES = {
     "calibrated_speed": lambda: (0.1, 0.2),
     "alphas": lambda: None,
     **dict.fromkeys(("wheels", "shares"), lambda: (0.3, 0.01, 0.01)),
-    **{f"Odometry.{each}.added": lambda: (0.1, 0.1, 0.1) for each in ("drive", "move")},
     "model": lambda: made("MotionModel"),
-    "Odometry.mount": lambda: (0.1, 0.0, 0.2),
+    **dict.fromkeys(("end_ns", "stop_ns"), lambda: 3 * 10**9),
+    **dict.fromkeys(("duration_ns", "rest_ns", "at_ns"), lambda: 10**9),
+    **{f"{each}.forward": lambda: 0.5 for each in ("OdometryInterval", "Segmenter.drive")},
+    **{f"{each}.motion": lambda: (POSE, covariance(3)) for each in ("TimedScan", "Keyframe")},
+    "Keyframe.shift": lambda: (1.0, 0.0, 0.0, 0.5),
+    "Keyframe.rest": lambda: (POSE, covariance(3)),
+    "looks": lambda: [made("TimedScan")],
+    "is_node": lambda: True,
+    "OpenWindow.advance.keyframe": lambda: made("Keyframe"),
+    "OpenWindow.move.rest": lambda: made("Keyframe"),
+    "OpenWindow.restart.keyframes": lambda: [made("Keyframe")],
+    "segmenter": lambda: driven_segmenter(),
+    "interval": lambda: made("OdometryInterval"),
+    **dict.fromkeys(("keyframe_ns", "window_ns", "jump_ns"), lambda: 10**9),
+    "bounds": lambda: made("StreamBounds"),
+    **dict.fromkeys(("interval_s", "speed_m_s", "yaw_rate_rad_s", "extent_m"), lambda: 1e3),
+    **dict.fromkeys(("sigma_m", "sigma_rad"), lambda: (1e-8, 1e3)),
+    "calibration": lambda: made("Calibration"),
+    "most_landmarks": lambda: 3,
     # calibration
     **dict.fromkeys(("range_offset", "bearing_offset", "optical_axis"), lambda: 0.1),
     **dict.fromkeys(("range_scale", "half_field"), lambda: 1.0),
@@ -235,8 +257,16 @@ def advanced_window() -> tuple[core.Window, core.Step]:
 
 def opened_window() -> core.OpenWindow:
     opened = made("OpenWindow")
-    opened.admit(**examples_of("OpenWindow.admit"))
+    opened.advance(made("Keyframe"))
     return opened
+
+
+def driven_segmenter() -> core.Segmenter:
+    segmenter = made("Segmenter")
+    segmenter.observe(10**9, made("Scan"))
+    segmenter.observe(3 * 10**9, core.Scan.unnamed(POINT.tobytes(), POINT.tobytes()))
+    segmenter.drive(2 * 10**9, 10**9, 0.5, 0.1)
+    return segmenter
 
 
 def longer_chain() -> core.Chain:
@@ -249,6 +279,7 @@ OBJECTS = {
     "Window": lambda: advanced_window()[0],
     "Step": lambda: advanced_window()[1],
     "OpenWindow": opened_window,
+    "Segmenter": driven_segmenter,
     "Chain": longer_chain,
     "ChainSolution": lambda: longer_chain().solve(3, 1e-6),
 }

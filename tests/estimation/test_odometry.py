@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from teamslam.team.config import MotionModel, MotionNoise
-from teamslam.team.estimation.models import Increment, increment_of
+from teamslam.team.estimation.models import Increment, increment_of, model_of
 from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
 from teamslam.team.estimation.se2 import between, exponential, logarithm
 
@@ -20,7 +20,11 @@ CLAIM = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.004], [0.002, -0.004, 0.0
 
 
 def interval(increment: list[float], claim: np.ndarray | None = None) -> OdometryInterval:
-    return OdometryInterval(SECOND, SECOND, 0.0, 0.0, moved(np.array(increment), claim))
+    return OdometryInterval(SECOND, SECOND, 0.0, 0.0, *moved(np.array(increment), claim))
+
+
+def part(whole: OdometryInterval, motion: MotionModel, duration_ns: int, rest_ns: int) -> Increment:
+    return Increment(*whole.part(model_of(motion), duration_ns, rest_ns))
 
 
 @pytest.mark.parametrize("claim", [None, CLAIM])
@@ -31,7 +35,7 @@ def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts):
     ends = [0, *(round(cut * SECOND) for cut in cuts), SECOND]
     total = Increment.identity()
     for begin, end in pairwise(ends):
-        total = total.then(whole.part(motion, end - begin, SECOND - end))
+        total = total.then(part(whole, motion, end - begin, SECOND - end))
     np.testing.assert_allclose(total.mean, [0.8, -0.3, 0.7], atol=1e-12)
     np.testing.assert_allclose(total.covariance, np.zeros((3, 3)) if claim is None else claim,
                                atol=1e-12)  # fmt: skip
@@ -40,10 +44,10 @@ def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts):
 def test_the_densities_of_the_parts_of_an_increment_add_up_to_nearly_those_of_the_whole():
     dense = MotionModel(forward=MotionNoise(0, 0.05), turn=MotionNoise(0, 0.02))
     whole = interval([0.8, -0.3, 0.7])
-    one = whole.part(dense, SECOND, 0)
+    one = part(whole, dense, SECOND, 0)
     total = Increment.identity()
     for k in range(100):
-        total = total.then(whole.part(dense, SECOND // 100, SECOND - (k + 1) * SECOND // 100))
+        total = total.then(part(whole, dense, SECOND // 100, SECOND - (k + 1) * SECOND // 100))
     np.testing.assert_allclose(np.diag(total.covariance), np.diag(one.covariance), rtol=0.2)
 
 
@@ -52,7 +56,7 @@ def test_an_increment_without_a_lateral_part_is_the_arc_of_its_speeds(way):
     wheels = MotionModel("differential-drive", wheel_base=0.5, left_wheel=0.1, right_wheel=0.02)
     for motion in (NOISY, wheels):
         arc = increment_of(motion, 1.0, way, 0.4)
-        told = interval(arc.mean.tolist()).part(motion, SECOND, 0)
+        told = part(interval(arc.mean.tolist()), motion, SECOND, 0)
         np.testing.assert_allclose(told.mean, arc.mean, atol=1e-12)
         np.testing.assert_allclose(told.covariance, arc.covariance, atol=1e-12)
 
@@ -69,7 +73,7 @@ def test_the_noise_of_an_increment_is_what_central_differences_of_its_arc_say():
     ]  # fmt: skip
     J = np.column_stack([*columns, [-along[1], along[0], 0.0]])
     expected = J @ np.diag([0.09, 0.04, 0.01]) @ J.T
-    told = interval(end.tolist()).part(motion, SECOND, 0)
+    told = part(interval(end.tolist()), motion, SECOND, 0)
     np.testing.assert_allclose(told.covariance, expected, atol=1e-9)
 
 

@@ -6,14 +6,9 @@ from teamslam.team import core
 from teamslam.team.config import Bounds, Sensor
 from teamslam.team.core import landmarks_along_paths
 from teamslam.team.estimation.models import noise_of, predicted
-from teamslam.team.estimation.scans import (
-    POINT,
-    POLAR,
-    point_scan,
-    polar_scan,
-    sensible,
-    unclaimed,
-)
+from teamslam.team.estimation.odometry import stream_bounds
+from teamslam.team.estimation.scans import POINT, POLAR, Scan
+from teamslam.team.rejection import BY_CORE, Rejection
 from tests.estimation.hybrid_slam import one_landmark
 
 POSE = np.array([0.5, -1.0, 0.7])
@@ -36,6 +31,10 @@ def turn(angle: float) -> np.ndarray:
     return np.array([[c, -s], [s, c]])
 
 
+def polar(*parts: np.ndarray) -> Scan:
+    return Scan.polar(*(part.tobytes() for part in parts))
+
+
 def updated(scan) -> tuple[np.ndarray, np.ndarray]:
     seen = scan.ranges, scan.bearings
     return one_landmark.updated(MEAN, packed(SPREAD), POSE, seen, SENSOR, scan.own)[:2]
@@ -43,7 +42,7 @@ def updated(scan) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane():
     point = np.array([[2.5, 1.5]])
-    mean, P = updated(point_scan(IDS, point, CLAIM[None]))
+    mean, P = updated(Scan.points(IDS.tobytes(), point.tobytes(), CLAIM.tobytes()))
     H = turn(POSE[2]).T
     S = H @ SPREAD @ H.T + full(CLAIM)
     K = SPREAD @ H.T @ np.linalg.inv(S)
@@ -54,7 +53,7 @@ def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_
 
 def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does():
     seen, R = np.array([4.0, 0.3]), np.array([[0.04, 0.006], [0.006, 0.002]])
-    mean, P = updated(polar_scan(IDS, seen[:1], seen[1:], packed(R)[None]))
+    mean, P = updated(polar(IDS, seen[:1], seen[1:], packed(R)))
     r, b = predicted(POSE, MEAN)
     H = core.predict(POSE, MEAN[None])[2][0]
     K = SPREAD @ H.T @ np.linalg.inv(H @ SPREAD @ H.T + R)
@@ -67,7 +66,7 @@ def test_points_near_with_much_noise_place_a_landmark_without_a_bias():
     truth, sigma, count = np.array([0.6, 0.2]), 0.2, 4000
     points = truth + sigma * rng.standard_normal((count, 2))
     claims = np.tile([sigma**2, 0.0, sigma**2], (count, 1))
-    scan = point_scan(np.zeros(count, np.uint32), points, claims)
+    scan = Scan.points(bytes(4 * count), points.tobytes(), claims.tobytes())
     polar = np.column_stack((scan.ranges, scan.bearings))
     found = {}
     for form in (POINT, POLAR):
@@ -118,25 +117,28 @@ def test_landmarks_along_paths_are_least_squares_with_the_windows_correlations(w
 
 
 def test_a_claim_is_carried_to_another_pose_as_the_plane_turns():
-    scan = point_scan(IDS, np.array([[2.0, 1.0]]), CLAIM[None])
-    larger = scan._replace(own=scan.own * [3.0, 3.0, 3.0, 1.0])
+    scan = Scan.points(IDS.tobytes(), np.array([2.0, 1.0]).tobytes(), CLAIM.tobytes())
+    seen = scan.ids, scan.ranges, scan.bearings
+    larger = Scan(*seen, scan.own * [3.0, 3.0, 3.0, 1.0])
     back = np.array([0.3, -0.4, 0.5])
     to = back[:2] + turn(back[2]) @ [2.0, 1.0]
-    ids, ranges, bearings, own = core.reduce_scans([scan], back[None])
+    reduced = core.reduce_scans([scan], back[None])
     turned = turn(back[2]) @ full(CLAIM) @ turn(back[2]).T
-    expected = point_scan(IDS, to[None], packed(turned)[None])
-    assert ids.tolist() == IDS.tolist()
-    for found, of_plane in zip((ranges, bearings, own), expected[1:], strict=True):
-        np.testing.assert_allclose(found, of_plane)
-    mean = core.reduce_scans([scan, larger], np.array([back, back]))[3]
-    np.testing.assert_allclose(mean[0, :3], 2.0 * own[0, :3])
-    bare = scan._replace(own=unclaimed(1))
-    mixed = core.reduce_scans([bare, scan], np.array([back, back]))[3]
-    np.testing.assert_array_equal(mixed, own, "a scan without covariances says nothing of them")
+    expected = Scan.points(IDS.tobytes(), to.tobytes(), packed(turned).tobytes())
+    assert reduced.ids.tolist() == IDS.tolist()
+    for name in ("ranges", "bearings", "own"):
+        np.testing.assert_allclose(getattr(reduced, name), getattr(expected, name))
+    mean = core.reduce_scans([scan, larger], np.array([back, back])).own
+    np.testing.assert_allclose(mean[0, :3], 2.0 * reduced.own[0, :3])
+    mixed = core.reduce_scans([Scan(*seen), scan], np.array([back, back])).own
+    np.testing.assert_array_equal(mixed, reduced.own, "the other scan has no covariances")
 
 
 def test_claims_beyond_the_bounds_are_named():
-    claims = np.array([[0.1, 0.0, 0.2], [1e-18, 0.0, 0.2], [0.1, 0.0, 1e30]])
-    ranges = np.ones(3)
-    scan = polar_scan(np.arange(3, dtype=np.uint32), ranges, np.zeros(3), claims)
-    assert sensible(scan.own, ranges, Bounds()).tolist() == [True, False, False]
+    claims = np.array([[0.1, 0.0, 0.2], [1e-18, 0.0, 0.2], [0.1, 0.0, 1e30], [0.1, 0.0, np.nan]])
+    scan = polar(np.arange(4, dtype=np.uint32), np.ones(4), np.zeros(4), claims)
+    judge = core.StreamJudge(stream_bounds(Bounds()))
+    assert judge.judge_scan(0, scan) == 0
+    assert scan.ids.tolist() == [0]
+    alone = polar(IDS, np.ones(1), np.zeros(1), claims[1])
+    assert BY_CORE[judge.judge_scan(0, alone)] is Rejection.RANGE

@@ -2,7 +2,7 @@ import gc
 
 import numpy as np
 
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.maps import CONDENSED
 from teamslam.team.robot.node import RobotNode

@@ -16,6 +16,7 @@ from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import RerunError, index_log
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.models import model_of
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.ros2 import encoding as ros
 from teamslam.team.ros2.bags import new_bag
@@ -48,7 +49,8 @@ class _Robot:
         if message.incarnation != self.incarnation:
             self.incarnation, self.pose = message.incarnation, (0.0, 0.0, 0.0)
         interval = translate.interval_of(message, self.config)
-        step = interval.part(self.config.motion, interval.duration_ns, 0).mean.tolist()
+        mean, _ = interval.part(model_of(self.config.motion), interval.duration_ns, 0)
+        step = mean.tolist()
         self.pose = ros.compose(self.pose, (step[0], step[1], step[2]))
         stamp_ns, names = interval.end_ns, self.names
         self.answers.add_odometry(stamp_ns, self.pose)

@@ -207,7 +207,7 @@ def _landmark_curve(
 ) -> Figures | None:
     landmark = next(
         (
-            int(translate.scan_of(message)[0][0])
+            int(translate.scan_of(message).ids[0])
             for message in messages(samples, ch.OBSERVATIONS.key(robot))
             if isinstance(message, m.AnyScan) and message.ids
         ),

@@ -16,14 +16,15 @@ from teamslam.sim.studies.robots.estimator import (
     RobotEstimator,
     estimator_of,
 )
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
 from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindow
+from teamslam.team.estimation.odometry import stream_bounds
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
-from teamslam.team.rejection import UNMEASURED, Rejection
+from teamslam.team.rejection import BY_CORE, UNMEASURED, Rejection
 from teamslam.team.robot.mapper import Mapper
 from teamslam.team.robot.maps import InitialPose
 from teamslam.team.robot.statements import MessageWriter
@@ -158,6 +159,7 @@ class StreamMapper(ExchangingMapper):
         known = self._known or NOTHING_KNOWN
         self.estimator: RobotEstimator = estimator_of(self.config, incarnation, initial, known)
         self.ledger.used, self.joint = self.estimator.used, self.estimator.joint
+        self._judge = core.StreamJudge(stream_bounds(self.config.bounds))
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
         """Raise ValueError: there are no submaps."""
@@ -188,14 +190,16 @@ class StreamMapper(ExchangingMapper):
 
     def drive(self, measurement: m.AnyOdometry) -> bool:
         """Process an odometry interval."""
-        interval, rejected = self.judge_interval(measurement)
-        estimates = None
-        if interval is not None:
+        interval = translate.interval_of(measurement, self.config)
+        end_ns, estimates = interval.end_ns, None
+        rejected: Rejection | None = Rejection.TIME
+        if self.note_time(end_ns, end_ns):
+            rejected = BY_CORE[self._judge.judge(interval)]
+        if rejected in UNMEASURED:
             estimates = self.estimator.drive(interval, measured=rejected is None)
         self.account(measurement, rejected)
         if rejected in UNMEASURED:
-            offset_s = self.config.clock_offset_s
-            self.ledger.cover(translate.team_time_of(measurement, offset_s))
+            self.ledger.cover(end_ns)
         if estimates is not None:
             self._publish(estimates)
         return False
@@ -228,6 +232,11 @@ class StreamMapper(ExchangingMapper):
         super().account(measurement, rejected)
         self.forget_window()
 
+    @property
+    def judge(self) -> core.StreamJudge:
+        """Checks the stream's times."""
+        return self._judge
+
     def note_input(self, number: int) -> None:
         """Ignore inputs of windows: there are none."""
 
@@ -236,7 +245,8 @@ class StreamMapper(ExchangingMapper):
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Process a scan; return the reason of a rejection."""
-        return self.estimator.observe(stamp_ns, scan)
+        beyond = BY_CORE[self._judge.judge_scan(stamp_ns, scan)]
+        return beyond or self.estimator.observe(stamp_ns, scan)
 
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
         """Reject inter-robot measurements."""

@@ -11,25 +11,26 @@ import numpy as np
 from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep
 from teamslam.sim.studies.robots.estimator import Estimates, KnownMap
 from teamslam.sim.studies.robots.filters import FILTERS
+from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import (
     LandmarkGaussian,
     NotACovarianceError,
     PoseGaussian,
 )
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.odometry import OdometryInterval, segmenter_of
 from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import FEEDBACK
-from teamslam.team.rejection import Rejection
+from teamslam.team.rejection import BY_CORE, Rejection
 from teamslam.team.robot.maps import Cloud, InitialPose, thin_out
+
+NOTHING_SEEN = Scan(np.empty(0, np.uint32), np.empty(0), np.empty(0))
 
 
 class RunningEstimator:
@@ -45,10 +46,11 @@ class RunningEstimator:
         self._filter = FILTERS[config.estimator]
         self.associates = self._filter.took is not None and config.fusion == "alone"
         self._taken: list[slice] = []
-        self._looks: list[KeyframeScan] = []
+        self._looks: list[core.TimedScan] = []
         maps_at_keyframes = config.fusion in FEEDBACK
         self._map_every_ns = 0 if maps_at_keyframes else round(config.front_end.window_s * 1e9)
-        self._segmenter = Segmenter(config.motion, config.sensor, config.front_end.keyframe_s)
+        keyframe_s = config.front_end.keyframe_s
+        self._segmenter = segmenter_of(config.motion, config.sensor, keyframe_s)
         self._generator = generator(config.seed, config.id, incarnation, 0)
         self._map_ns: int | None = None
         self._innovation = NOTHING
@@ -81,10 +83,9 @@ class RunningEstimator:
         """Process a scan (ids, ranges, bearings); return the reason of a rejection."""
         if not self._filter.looks:
             return Rejection.NO_LANDMARKS
-        unnamed = bool((scan.ids >= UNNAMED).any())
-        if scan.own.size and not self._filter.claims and not unnamed:
+        if scan.own.size and not self._filter.claims and not scan.is_unnamed:
             return Rejection.CLAIMS
-        return self._segmenter.observe(stamp_ns, *scan)
+        return BY_CORE[self._segmenter.observe(stamp_ns, scan)]
 
     def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
         """Process one odometry interval and its keyframes."""
@@ -93,11 +94,11 @@ class RunningEstimator:
             self._segmenter.begin(begin_ns)
             self._map_ns = begin_ns
         before = self.sequence
-        for keyframe in self._segmenter.drive(interval, measured=measured):
+        self._segmenter.integrate(interval, measured)
+        for keyframe in self._segmenter.take_keyframes():
             self._take(keyframe)
         if not self._filter.looks:
-            _, rest = self._segmenter.cut(stamp_ns)
-            self._advance(stamp_ns, rest)
+            self._advance(stamp_ns, Increment(*self._segmenter.cut(stamp_ns).motion))
         return self._driven(before, last=False)
 
     def _driven(self, before: int, *, last: bool) -> Estimates:
@@ -122,31 +123,30 @@ class RunningEstimator:
             return None
         return partial(thin_out, self._filter.particles(self._state), np.zeros(3))
 
-    def _take(self, keyframe: Keyframe) -> None:
+    def _take(self, keyframe: core.Keyframe) -> None:
         for look in keyframe.looks:
             self._looks.append(look)
-            seen = look.ids, look.ranges, look.bearings, look.own
             first = self._took()
-            self._advance(look.at_ns, look.motion or Increment.identity(), *seen)
+            assert look.motion is not None
+            self._advance(look.at_ns, Increment(*look.motion), look.scan)
             self._taken.append(slice(first, self._took()))
-        seen = keyframe.ids, keyframe.ranges, keyframe.bearings, keyframe.own
-        motion = keyframe.increment if keyframe.rest is None else keyframe.rest
-        if not keyframe.looks or len(keyframe.ids) or motion.mean.any():
-            self._advance(keyframe.stamp_ns, motion, *seen)
+        motion = Increment(*(keyframe.motion if keyframe.rest is None else keyframe.rest))
+        if not keyframe.looks or len(keyframe.scan) or motion.mean.any():
+            self._advance(keyframe.stamp_ns, motion, keyframe.scan)
 
     def _became(self) -> Became | None:
         if not self._looks or self._filter.took is None:
             return None
         numbers = self._filter.took(self._state)
         of_look = [
-            numbers[taken] if len(numbers[taken]) == len(look.ids) else np.zeros(len(look.ids))
+            numbers[taken] if len(numbers[taken]) == len(look.scan) else np.zeros(len(look.scan))
             for look, taken in zip(self._looks, self._taken, strict=True)
         ]
         landmarks = np.concatenate(of_look).astype(np.int64)
         return Became(
             stamps=np.array([look.stamp_ns for look in self._looks], np.int64),
-            counts=np.array([len(look.ids) for look in self._looks], np.int64),
-            rows=np.concatenate([look.ids for look in self._looks]).astype(np.int64) - UNNAMED,
+            counts=np.array([len(look.scan) for look in self._looks], np.int64),
+            rows=np.concatenate([look.scan.ids for look in self._looks]).astype(np.int64) - UNNAMED,
             landmarks=landmarks,
             clutter=np.zeros(len(landmarks), np.bool_),
         )
@@ -154,8 +154,9 @@ class RunningEstimator:
     def _took(self) -> int:
         return 0 if self._filter.took is None else len(self._filter.took(self._state))
 
-    def _advance(self, stamp_ns: int, increment: Increment, *scan: np.ndarray) -> None:
-        step = RobotStep(self._config.id, increment, self._config.sensor, *scan)
+    def _advance(self, stamp_ns: int, increment: Increment, scan: Scan = NOTHING_SEEN) -> None:
+        seen = scan.ids, scan.ranges, scan.bearings, scan.own
+        step = RobotStep(self._config.id, increment, self._config.sensor, *seen)
         after = self._after(step)
         if after is None:  # no solution with the measurements: the motion alone
             self.unsolved += bool(len(step.ids))
@@ -184,7 +185,8 @@ class RunningEstimator:
         uncovered = self._segmenter.uncovered
         before = self.sequence
         if self._segmenter.now_ns is not None:
-            for keyframe in self._segmenter.cut(self._segmenter.now_ns)[0]:
+            self._segmenter.cut(self._segmenter.now_ns)
+            for keyframe in self._segmenter.take_keyframes():
                 self._take(keyframe)
         driven = self._driven(before, last=True)
         return msgspec.structs.replace(driven, became=self._became()), uncovered

@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from typing import NamedTuple
 
-from teamslam.team import translate
-from teamslam.team.config import Bounds, RobotConfig
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, Segmenter
-from teamslam.team.estimation.scans import sensible
-from teamslam.team.rejection import UNMEASURED
-from teamslam.team.robot.stream import Inbox, StreamJudge
+from teamslam.team import core, translate
+from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.odometry import segmenter_of
+from teamslam.team.rejection import BY_CORE, UNMEASURED
+from teamslam.team.robot.stream import Inbox
 from teamslam.team.wire import messages as m
 
 
@@ -21,7 +20,7 @@ class RobotKeyframe(NamedTuple):
     stamp_ns: int
     robot: str
     number: int
-    keyframe: Keyframe
+    keyframe: core.Keyframe
 
 
 @dataclass
@@ -34,8 +33,7 @@ class _Stream:
     robot: str
     config: RobotConfig | None = None
     inbox: Inbox = field(default_factory=Inbox)
-    segmenter: Segmenter | None = None
-    judge: StreamJudge = field(default_factory=lambda: StreamJudge(Bounds()))
+    segmenter: core.Segmenter | None = None
     start: m.InitialPose | None = None
     waiting: deque[RobotKeyframe] = field(default_factory=deque)
     covered_ns: float = float("-inf")
@@ -56,7 +54,8 @@ class _Stream:
         if self.complete and self.covered_ns != float("inf"):
             segmenter = self.segmenter
             if segmenter is not None and segmenter.now_ns is not None and not self.broken:
-                self._file(segmenter.cut(segmenter.now_ns)[0], self.inbox.next_measurement - 1)
+                segmenter.cut(segmenter.now_ns)
+                self._file(segmenter.take_keyframes(), self.inbox.next_measurement - 1)
             self.covered_ns = float("inf")
 
     def _take(self, measurement: m.Measurement, config: RobotConfig) -> None:
@@ -64,30 +63,23 @@ class _Stream:
             case m.InitialPose() if self.start is None:
                 self.start = measurement
                 keyframe_s = config.front_end.keyframe_s
-                self.segmenter = Segmenter(config.motion, config.sensor, keyframe_s)
-                self.judge = StreamJudge(config.bounds)
+                self.segmenter = segmenter_of(
+                    config.motion, config.sensor, keyframe_s, bounds=config.bounds
+                )
             case m.InitialPose():
                 self.broken = True  # a later incarnation begins at an unknown pose
             case m.Observations() | m.Points() if self.segmenter is not None:
-                scan = translate.scan_of(measurement)
-                near = self.judge.near(scan.ranges)
-                near &= sensible(scan.own, scan.ranges, config.bounds)
-                if self.judge.time(measurement.stamp_ns) is None and (near.any() or not len(near)):
-                    self.segmenter.observe(measurement.stamp_ns, *scan.only(near))
+                self.segmenter.observe(measurement.stamp_ns, translate.scan_of(measurement))
             case m.Odometry() | m.Increment() | m.Steering() if self.segmenter is not None:
                 interval = translate.interval_of(measurement, config)
-                reason = self.judge.odometry(interval)
-                if reason not in UNMEASURED:
-                    return
-                if self.segmenter.now_ns is None:
-                    self.segmenter.begin(interval.end_ns - interval.duration_ns)
-                keyframes = self.segmenter.drive(interval, measured=reason is None)
-                self._file(keyframes, measurement.number)
-                self.covered_ns = interval.end_ns
+                outcome = self.segmenter.drive(interval)
+                if BY_CORE[outcome % core.Segmenter.DUE] in UNMEASURED:
+                    self._file(self.segmenter.take_keyframes(), measurement.number)
+                    self.covered_ns = interval.end_ns
             case _:
                 pass
 
-    def _file(self, keyframes: Sequence[Keyframe], measurement: int) -> None:
+    def _file(self, keyframes: Sequence[core.Keyframe], measurement: int) -> None:
         self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, measurement, e) for e in keyframes]
 
 

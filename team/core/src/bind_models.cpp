@@ -1,9 +1,6 @@
-// Bindings of the measurement model, and of what is done with scans before they are keyframes.
-#include <nanobind/stl/vector.h>
-
+// Bindings of the measurement model and of a sensor's calibration.
 #include "binding_scan.hpp"
 #include "calibration.hpp"
-#include "reduction.hpp"
 
 namespace teamslam::binding {
 
@@ -12,18 +9,10 @@ using models::Calibration, models::Polar;
 namespace {
 
 using Pose = se2::Pose<double>;
-using PythonScan = std::tuple<Ids, Numbers, Numbers, Table>;
 
 template <std::size_t N>
 void append(std::vector<double>& to, const std::array<std::array<double, N>, 2>& rows) {
   for (const auto& row : rows) to.insert(to.end(), row.begin(), row.end());
-}
-
-// The numbers of claims, (n, 4), or (n, 0) without any.
-MadeTable made_claims(std::span<const models::Claim> claims, std::size_t n) {
-  std::vector<double> own;
-  for (const models::Claim& each : claims) own.insert(own.end(), {each.rr, each.rb, each.bb, each.form});
-  return made<double, nb::ndim<2>>(std::move(own), {n, claims.empty() ? 0u : 4u});
 }
 
 void bind_calibration(nb::module_& m) {
@@ -116,27 +105,6 @@ void bind_models(nb::module_& m) {
       "pose"_a, "measurements"_a, "noise"_a, "own"_a,
       "Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).\n\n"
       "noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.");
-  m.def(
-      "reduce_scans",
-      [](const std::vector<PythonScan>& scans, const Table& poses) {
-        check(poses.shape(0) == scans.size() && (poses.shape(1) == 3 || scans.empty()), "poses must be (m, 3), one of each scan");
-        finite(poses, "poses");
-        std::vector<window::Scan> views;
-        std::vector<Pose> from;
-        for (std::size_t i = 0; i < scans.size(); i++) {
-          const auto& [ids, ranges, bearings, own] = scans[i];
-          views.push_back(scan_of(ids, ranges, bearings, own));
-          from.push_back({poses(i, 0), poses(i, 1), poses(i, 2)});
-        }
-        window::Reduced reduced = window::reduce(views, from);
-        const std::size_t n = reduced.ids.size();
-        return std::tuple(made<std::uint32_t, nb::ndim<1>>(std::move(reduced.ids), {n}), std::move(reduced.ranges),
-                          std::move(reduced.bearings), made_claims(reduced.claims, n));
-      },
-      "scans"_a.noconvert(), "poses"_a,
-      "Reduce scans (ids, ranges, bearings, own) to one measurement per landmark, by ascending id.\n\n"
-      "poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,\n"
-      "moved to the keyframe's end; its covariance is the mean of those that its measurements bring.");
 }
 
 }  // namespace teamslam::binding

@@ -1,22 +1,16 @@
 // Bindings of odometry: motions of an interval, and their composition.
-#include <nanobind/stl/vector.h>
-
 #include "binding_scan.hpp"
-#include "odometry.hpp"
 
 namespace teamslam::binding {
 
-using motion::Densities, motion::Model, motion::Odometry;
+using motion::Densities, motion::Interval, motion::Model, motion::Nanoseconds;
 
 namespace {
 
 using Pose = se2::Pose<double>;
 using Mean = const Pose&;
 using Covariance = const linalg::Matrix3&;
-using MadeIncrement = std::tuple<Pose, linalg::Matrix3>;
 using Three = std::array<double, 3>;
-
-MadeIncrement made_increment(const motion::Increment& of) { return {of.mean, of.covariance}; }
 
 void bind_model(nb::module_& m) {
   nb::class_<Model>(m, "MotionModel", "The parameters of a motion model, as of `teamslam.team.config.MotionModel`.")
@@ -81,66 +75,37 @@ void bind_motion(nb::module_& m) {
       },
       "mean"_a, "covariance"_a, "mount"_a, "Convert a motion T of the base to the sensor's at m: T Exp(xi) m = m (m^-1 T m) Exp(Ad(m^-1) xi).");
 
-  nb::class_<Odometry>(m, "Odometry",
-                       "Odometry integrated since the places that matter to a window.\n\n"
-                       "With a mount the motions since a keyframe and a scan are the sensor's; those since a pose node and an\n"
-                       "inter-robot measurement are the base's. A motion is (mean, covariance).")
+  nb::class_<Interval>(m, "OdometryInterval",
+                       "An odometry interval until end_ns: mean forward speed [m/s] and yaw rate [rad/s].\n\n"
+                       "twist: (forward [m], left [m], turn [rad]) of a reported motion Exp(twist), which has these speeds; covariance:\n"
+                       "reported, of the error in the tangent space of its end.")
       .def(
           "__init__",
-          [](Odometry* self, const Model& model, const std::optional<Three>& mount) {
-            std::optional<Pose> at;
-            if (mount) at = {(*mount)[0], (*mount)[1], (*mount)[2]};
-            new (self) Odometry(model, at);
+          [](Interval* self, Nanoseconds end_ns, Nanoseconds duration_ns, double forward, double yaw_rate,
+             const std::optional<se2::Motion>& twist, const std::optional<linalg::Matrix3>& covariance) {
+            new (self) Interval(checked({end_ns, duration_ns, forward, yaw_rate, twist, covariance}));
           },
-          "model"_a, "mount"_a.none(), "mount: the sensor's pose on the base; None where it is at the base's origin.")
-      .def("drive", nb::overload_cast<double, double, double, const std::optional<Odometry::Unmeasured>&>(&Odometry::drive),
-           "duration_s"_a, "forward"_a, "yaw_rate"_a, "added"_a.none(),
-           "Integrate a part of an interval whose speeds were measured.\n\nadded: variances per second, in addition to the noise.")
+          "end_ns"_a, "duration_ns"_a, "forward"_a, "yaw_rate"_a, "twist"_a = nb::none(), "covariance"_a = nb::none())
+      .def_ro("end_ns", &Interval::end_ns)
+      .def_ro("duration_ns", &Interval::duration_ns)
+      .def_ro("forward", &Interval::forward)
+      .def_ro("yaw_rate", &Interval::yaw_rate)
+      .def_ro("twist", &Interval::twist)
+      .def_ro("covariance", &Interval::covariance)
+      .def_prop_ro("speed", &Interval::speed, "Magnitude of the velocity [m/s]; without a reported motion, signed.")
       .def(
-          "move",
-          [](Odometry& self, const se2::Motion& twist, const std::optional<linalg::Matrix3>& covariance, double interval_s,
-             double duration_s, double share, double rest, const std::optional<Odometry::Unmeasured>& added) {
-            self.drive({twist, interval_s, covariance}, duration_s, share, rest, added);
+          "gone_on",
+          [](const Interval& self, Nanoseconds end_ns, Nanoseconds duration_ns) {
+            return checked(checked(self).gone_on(end_ns, duration_ns));
           },
-          "twist"_a, "covariance"_a.none(), "interval_s"_a, "duration_s"_a, "share"_a, "rest"_a, "added"_a.none(),
-          "Integrate a part of an interval whose motion was measured, as `MotionModel.part`.")
+          "end_ns"_a, "duration_ns"_a, "Extrapolate to a later interval at the same speeds.")
       .def(
-          "end_keyframe",
-          [](Odometry& self) {
-            const auto [motion, shift, seconds, rest] = self.end_keyframe();
-            std::optional<MadeIncrement> since_unnamed;
-            if (rest) since_unnamed = made_increment(*rest);
-            return std::tuple(made_increment(motion), std::vector{shift.forward, shift.left, shift.turn, seconds}, since_unnamed);
+          "part",
+          [](const Interval& self, const Model& model, Nanoseconds duration_ns, Nanoseconds rest_ns) {
+            return made_increment(self.part(model, duration_ns, rest_ns));
           },
-          "End the motion since the last keyframe here.\n\n"
-          "Returns it; its shift (forward, left, turn) by an error of the scale of speed, with its duration [s]; and the\n"
-          "motion since the last scan without identities, if there was one.")
-      .def("pass_unnamed_scan", [](Odometry& self) { return made_increment(self.pass_unnamed_scan()); },
-           "Return the motion since the last scan without identities or keyframe, and begin anew here.")
-      .def("mark_scan", &Odometry::mark_scan, "Mark a scan here, of a keyframe of several scans.")
-      .def(
-          "end_scans",
-          [](Odometry& self) {
-            const std::vector<Pose> scans = self.end_scans();
-            dense::Matrix poses(scans.size(), 3);
-            for (std::size_t k = 0; k < scans.size(); k++) {
-              const auto& [x, y, heading] = scans[k];
-              poses[k][0] = x, poses[k][1] = y, poses[k][2] = heading;
-            }
-            return poses;
-          },
-          "Return the poses (m, 3) at the marked scans, seen from here, where the next keyframe's scans begin.")
-      .def("since_node", [](const Odometry& self) { return made_increment(self.since_node()); }, "The motion since the last pose node.")
-      .def(
-          "reach_node",
-          [](Odometry& self) {
-            std::vector<MadeIncrement> since;
-            for (const motion::Increment& each : self.reach_node()) since.push_back(made_increment(each));
-            return since;
-          },
-          "Begin the motion since the last pose node here; return the motions since the marked sightings, and forget these.")
-      .def("mark_sighting", &Odometry::mark_sighting, "Mark an inter-robot measurement here, for the next pose node.")
-      .def("forget_sightings", &Odometry::forget_sightings, "Forget the marked sightings.");
+          "model"_a, "duration_ns"_a, "rest_ns"_a,
+          "Compute the motion of a part of the interval, rest_ns before its end, as `MotionModel.part`.");
 }
 
 }  // namespace teamslam::binding

@@ -284,7 +284,7 @@ struct ArrayCaster {
   bool from_python(handle from, std::uint32_t flags, cleanup_list* cleanup) noexcept {
     if (!std::is_same_v<T, double>) flags &= ~std::uint32_t(cast_flags::convert);
     make_caster<Given> caster;
-    if (!caster.from_python(from, flags, cleanup)) return false;
+    if (!caster.from_python(from, flags, cleanup) || !caster.value.is_valid()) return false;  // None is no array
     given_ = std::move(caster.value);
     teamslam::binding::set(value, given_);
     return true;
@@ -341,8 +341,8 @@ void bind_maps(nb::module_& m);
 void bind_models(nb::module_& m);
 void bind_motion(nb::module_& m);
 void bind_se2(nb::module_& m);
+void bind_segmenter(nb::module_& m);
 void bind_sparse(nb::module_& m);
-void bind_open_window(nb::module_& m);
 void bind_random(nb::module_& m);
 void bind_window(nb::module_& m);
 

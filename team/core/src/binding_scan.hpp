@@ -3,12 +3,32 @@
 
 #include "binding.hpp"
 #include "consensus.hpp"
+#include "segmenter.hpp"
 
 namespace teamslam::binding {
 
 template <class Array>
 se2::Pose<double> pose_of(const Array& pose) {
   return {pose.data()[0], pose.data()[1], pose.data()[2]};
+}
+
+// (mean, covariance) of a motion.
+using MadeIncrement = std::tuple<se2::Pose<double>, linalg::Matrix3>;
+
+inline MadeIncrement made_increment(const motion::Increment& of) { return {of.mean, of.covariance}; }
+
+// A stamp or a duration: of a message, below 2⁶² ns, with the offset of its clock.
+inline motion::Nanoseconds checked_ns(motion::Nanoseconds stamp_ns) {
+  constexpr motion::Nanoseconds MOST = window::Segmenter::NEVER + window::Segmenter::NEVER / 4;
+  check(stamp_ns >= -MOST && stamp_ns <= MOST, "a time must be within 182 years of 0");
+  return stamp_ns;
+}
+
+inline motion::Interval checked(motion::Interval interval) {
+  checked_ns(interval.end_ns);
+  checked_ns(interval.duration_ns);
+  check(interval.duration_ns >= 0, "duration_ns must not be negative");
+  return interval;
 }
 
 inline models::Noise noise_of(const std::array<double, 5>& noise) {

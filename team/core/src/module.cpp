@@ -25,5 +25,5 @@ NB_MODULE(TEAMSLAM_MODULE, m) {
   binding::bind_sparse(m);
   binding::bind_random(m);
   binding::bind_window(m);
-  binding::bind_open_window(m);
+  binding::bind_segmenter(m);
 }

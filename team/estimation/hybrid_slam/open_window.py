@@ -5,7 +5,7 @@ landmark under the odometry. At its end a smoother over the window compares all 
 solution the submap is the odometry's motion alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
@@ -13,15 +13,13 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import NotACovarianceError
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe, nearest_landmarks
 from teamslam.team.estimation.hybrid_slam.redrawing import redraw_paths
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import (
     AssociatedKeyframes,
     associate_keyframes,
 )
 from teamslam.team.estimation.hybrid_slam.window import Window
-from teamslam.team.estimation.models import Increment, noise_of
-from teamslam.team.estimation.mount import of_base
+from teamslam.team.estimation.models import noise_of
 from teamslam.team.estimation.plausibility import submap_beyond
 from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.estimation.submap import LocalMap
@@ -46,18 +44,15 @@ Solved = TypeVar("Solved")
 class OpenWindow:
     """The particles since the window's start, and the keyframes.
 
-    Random numbers are keyed by (seed, robot, incarnation, sequence).
+    core: takes keyframes and motions. Random numbers are keyed by (seed, robot, incarnation,
+    sequence).
     """
 
     def __init__(self, config: RobotConfig, incarnation: int, sequence: int) -> None:
         self._config = config
-        self._most = config.bounds.submap_landmarks
-        self._solvable = True
-        self._keyframes: list[Keyframe] = []
-        self._rest: Increment | None = None
         self.settled = AssociatedKeyframes(())
         front, sensor = config.front_end, config.sensor
-        self._core = core.OpenWindow(
+        self.core = core.OpenWindow(
             front.particles,
             noise_of(sensor),
             front.proposal == "fastslam2",
@@ -67,38 +62,14 @@ class OpenWindow:
             sensor.field_of_view,
             OUTLIER_SHARE,
             random_numbers(config.seed, config.id, incarnation, sequence),
+            config.bounds.submap_landmarks,
         )
-        self.particles = Window(front, sensor, self._core.window)
-
-    @property
-    def keyframes_ns(self) -> tuple[int, ...]:
-        """Team times of the keyframes."""
-        return tuple(each.stamp_ns for each in self._keyframes)
-
-    @property
-    def motion(self) -> Increment:
-        """The base's motion by odometry, as the sensor's."""
-        motion, sensor = Increment.identity(), self._config.sensor
-        steps = [each.increment for each in self._keyframes]
-        for each in steps if self._rest is None else [*steps, self._rest]:
-            step = of_base(each, np.array(sensor.mount)) if sensor.is_mounted else each
-            motion = motion.then(step)
-        return motion
+        self.particles = Window(front, sensor, self.core.window)
 
     @property
     def gated(self) -> int:
         """Number of measurements that others of the window contradicted."""
-        return self._core.rejected + self.settled.gated
-
-    def advance(self, keyframe: Keyframe) -> None:
-        """Move and weigh the particles with the measurements accepted so far.
-
-        A keyframe that contradicts an earlier one computes the window again.
-        """
-        if self._solvable and self._core.window.landmarks + len(keyframe.ids) > self._most:
-            keyframe = nearest_landmarks(keyframe, self.particles.landmarks, self._most)
-        self._keyframes.append(keyframe)
-        self._try(self._admit, keyframe)
+        return self.core.rejected + self.settled.gated
 
     def confirm(self) -> None:
         """Compute the window again if comparing all of it changes its measurements: by outliers, or
@@ -107,17 +78,15 @@ class OpenWindow:
         Depleted particles are computed with more of them (with identities and white errors:
         decision 20).
         """
-        self._try(self._settle)
-
-    def move(self, rest: Increment, forward: np.ndarray) -> None:
-        """Take the motion after the last keyframe; forward: as of `Keyframe`."""
-        if rest.mean.any() or rest.covariance.any():
-            self._rest = rest
-            self._try(self._core.move, rest.mean, rest.covariance, forward)
+        if self.core.is_solvable:
+            try:
+                self._settle()
+            except UNSOLVED:
+                self.core.give_up()
 
     def solve(self, step: Callable[[Window], Solved]) -> Solved | None:
         """Make the Gaussian of the window by `step`."""
-        if not self._solvable:
+        if not self.core.is_solvable:
             return None
         try:
             return step(self.particles)
@@ -128,53 +97,29 @@ class OpenWindow:
         """Whether there is a submap and it lies within the bounds."""
         return submap is not None and submap_beyond(submap, self._config.bounds) is None
 
-    def _admit(self, keyframe: Keyframe) -> None:
-        if not self._core.admit(*keyframe.arguments):
-            self._take_all(self._accepted())
-
-    def _accepted(self) -> list[Keyframe]:
-        accepted = [self._core.accepted(k) for k in range(len(self._keyframes))]
-        pairs = zip(self._keyframes, accepted, strict=True)
-        return [each if taken is None else each.only(taken) for each, taken in pairs]
-
     def _settle(self) -> None:
-        has_others = self._core.confirm()
-        has_unnamed = any(each.looks for each in self._keyframes)
-        if not (has_others or has_unnamed or self._is_depleted):
-            return
-        keyframes = self._accepted()
-        if has_unnamed:
+        has_others = self.core.confirm()
+        if self.core.has_unnamed:
             with np.errstate(all="ignore"):
-                self._associate(keyframes)
+                self._associate()
             return
+        particles = self._config.front_end.particles
         if has_others:
-            self._take_all(keyframes)
+            self.core.restart(self.core.accepted(), particles)
         if self._is_depleted:
-            self._take_all(keyframes, AGAIN)
+            self.core.restart(self.core.accepted(), AGAIN * particles)
 
-    def _associate(self, keyframes: Sequence[Keyframe]) -> None:
+    def _associate(self) -> None:
         """Give the window's detections identities, and compute it again with them."""
-        config = self._config
+        front, most = self._config.front_end, self._config.bounds.submap_landmarks
         self.settled = associate_keyframes(
-            keyframes, config.front_end.association, config.sensor, self._most
+            self.core.accepted(), front.association, self._config.sensor, most
         )
-        self._take_all(self.settled.keyframes)
-        redraw_paths(self.particles, self.settled.keyframes, self._core.random)
+        self.core.restart(self.settled.keyframes, front.particles)
+        redraw_paths(self.particles, self.settled.keyframes, self.core.random)
 
     @property
     def _is_depleted(self) -> bool:
         sensor = self._config.sensor
         white = sensor.range_white == sensor.bearing_white == 1.0
-        return white and self._core.least_effective < DEPLETED
-
-    def _take_all(self, keyframes: Sequence[Keyframe], times: int = 1) -> None:
-        self._core.begin(times * self._config.front_end.particles)
-        for keyframe in keyframes:
-            self._core.take(*keyframe.arguments)
-
-    def _try(self, step: Callable[..., None], *arguments: object) -> None:
-        if self._solvable:
-            try:
-                step(*arguments)
-            except UNSOLVED:
-                self._solvable = False
+        return white and self.core.least_effective < DEPLETED

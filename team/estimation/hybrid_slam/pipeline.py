@@ -1,7 +1,7 @@
 """Hybrid-SLAM on one robot's measurements: Brooks and Bailey 2009, HybridSLAM.
 
     a measurement comes in                        observe, sight, drive
-    particles move and weigh                      drive (OpenWindow.advance)
+    particles move and weigh                      advance (OpenWindow.advance)
     the window closes                             _is_full, _close
     landmarks are solved again along the paths    window.gaussian
     moments are matched                           window.gaussian
@@ -14,71 +14,65 @@ joins submaps.
 
 from dataclasses import replace
 
+from teamslam.team import core
 from teamslam.team.config import RobotConfig
-from teamslam.team.core import WholeMap
 from teamslam.team.estimation.hybrid_slam import window as windows
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
-from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
 from teamslam.team.estimation.hybrid_slam.window import (
     NOTHING,
+    ClosedWindow,
     Innovation,
     RunningWindow,
     Window,
 )
 from teamslam.team.estimation.inter_robot import CarriedPoint
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.odometry import OdometryInterval, nanoseconds, segmenter_of
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap
-from teamslam.team.rejection import Rejection
+from teamslam.team.rejection import BY_CORE, Rejection
 
-LONGEST_NS = 2**62
-"""No two stamps are as far apart."""
-
-
-def _nanoseconds(seconds: float) -> int:
-    """A configured duration [ns], bounded by the span of stamps."""
-    return min(round(seconds * 1e9), LONGEST_NS)
+DUE = core.Segmenter.DUE
 
 
 class HybridSlam:
     """One incarnation of a robot's stream, from its beginning or last submap.
 
-    sequence, last_keyframe_ns: of the open window. last_measurement: its newest, even a rejected
-    one; set by the caller.
+    segmenter: takes the odometry; where it says DUE, call `advance`. sequence: of the open window.
+    last_measurement: its newest, even a rejected one; set by the caller.
     """
 
     def __init__(self, config: RobotConfig, incarnation: int) -> None:
         front = config.front_end
         with_nodes = front.node_s > 0.0 and config.fusion == "join"
         self._config, self._incarnation = config, incarnation
+        self.segmenter = segmenter_of(
+            config.motion, config.sensor, front.keyframe_s, front.window_s, config.bounds
+        )
         self._grid = None
         if with_nodes:
-            self._grid = PoseGrid(config.sensor, front, config.gnss, config.motion)
-        self._segmenter = Segmenter(config.motion, config.sensor, front.keyframe_s, self._grid)
-        self._window_ns = _nanoseconds(front.window_s)
-        self._standing_ns = _nanoseconds(front.standing_s)
+            self._grid = PoseGrid(self.segmenter, config.sensor, front, config.gnss, config.motion)
+        self._window_ns = nanoseconds(front.window_s)
+        self._standing_ns = nanoseconds(front.standing_s)
         self._innovation, self._scans = NOTHING, 0
-        self._driven_m: float
         self._open: OpenWindow
-        self.last_keyframe_ns: int | None
-        self._start_ns: int | None = None
         self._begin_window(0, 0)
 
     def resume(self, sequence: int, last_measurement: int, end_ns: int) -> None:
         """Continue after an earlier submap."""
-        self._start_ns = end_ns
-        self._segmenter.begin(end_ns)
+        self.segmenter.resume(end_ns)
+        if self._grid is not None:
+            self._grid.begin(end_ns)
         self._begin_window(sequence + 1, last_measurement + 1)
 
     # A measurement comes in.
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan of landmarks; returns the reason if it is rejected."""
-        reason = self._segmenter.observe(stamp_ns, *scan)
-        self._scans += reason is None
-        return reason
+        verdict = self.segmenter.observe(stamp_ns, scan)
+        self._scans += not verdict
+        return BY_CORE[verdict]
 
     def sight(self, stamp_ns: int, measurement: int, looks: TeammateScan) -> Rejection | None:
         """Take inter-robot measurements; returns the reason if they are rejected."""
@@ -98,34 +92,35 @@ class HybridSlam:
 
     def _is_late(self, stamp_ns: int) -> bool:
         """Whether odometry has passed this time, or has not begun."""
-        now_ns = self._segmenter.now_ns
-        return self._start_ns is None or (now_ns is not None and stamp_ns < now_ns)
+        now_ns = self.segmenter.now_ns
+        return now_ns is None or stamp_ns < now_ns
 
-    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> ClosedWindow | None:
+    def drive(self, interval: OdometryInterval) -> ClosedWindow | None:
         """Take one odometry interval; returns the window that it closes, if any."""
-        stamp_ns = interval.end_ns
-        if self._start_ns is None:
-            self._start_ns = stamp_ns - interval.duration_ns
-            self._segmenter.begin(self._start_ns)
-        self._driven_m += abs(interval.speed) * interval.duration_ns * 1e-9
-        keyframes = self._segmenter.drive(interval, measured=measured)
-        for keyframe in keyframes:
-            self._open.advance(keyframe)
-            self.last_keyframe_ns = keyframe.stamp_ns
-        lasting_ns = stamp_ns - self._start_ns
-        if keyframes or lasting_ns >= self._window_ns:
-            if self._is_full(lasting_ns):
-                return self._close(self._start_ns, stamp_ns, self._segmenter.leave())
-            if self._grid is not None:
-                self._grid.go_on(stamp_ns)
+        return self.advance() if self.segmenter.drive(interval) >= DUE else None
+
+    def advance(self) -> ClosedWindow | None:
+        """Take the keyframes of the last interval; returns the window that it closes, if any."""
+        segmenter, grid = self.segmenter, self._grid
+        if grid is not None:
+            grid.pass_stops()
+        self._open.core.advance_by(segmenter)
+        start_ns, now_ns = segmenter.start_ns, segmenter.now_ns
+        assert start_ns is not None
+        assert now_ns is not None
+        if self._is_full(now_ns - start_ns):
+            return self._close(start_ns, now_ns, segmenter.leave())
+        if grid is not None:
+            grid.go_on(now_ns)
         return None
 
     def finish(self) -> tuple[ClosedWindow | None, int]:
         """End the stream; return the last submap, and the number of uncovered scans."""
-        uncovered, end_ns = self._segmenter.uncovered, self._segmenter.now_ns
-        if self._start_ns is None or end_ns is None or end_ns <= self._start_ns:
+        segmenter = self.segmenter
+        uncovered, start_ns, end_ns = segmenter.uncovered, segmenter.start_ns, segmenter.now_ns
+        if start_ns is None or end_ns is None or end_ns <= start_ns:
             return None, uncovered
-        return self._close(self._start_ns, end_ns), uncovered
+        return self._close(start_ns, end_ns), uncovered
 
     # The window closes.
 
@@ -136,20 +131,20 @@ class HybridSlam:
         """
         if 2 * self.window.core.landmarks >= self._config.bounds.submap_landmarks:
             return True
-        is_slow = self._driven_m < self._config.front_end.window_m
+        is_slow = self.segmenter.driven_m < self._config.front_end.window_m
         stands = is_slow and lasting_ns < self._standing_ns
         return lasting_ns >= self._window_ns and not stands
 
     def _close(self, start_ns: int, end_ns: int, late: int = 0) -> ClosedWindow:
         """Close the open window; without a solution its submap is the odometry's motion."""
-        last, rest = self._segmenter.cut(end_ns)
-        for keyframe in last:
-            self._open.advance(keyframe)
+        rest = self.segmenter.cut(end_ns)
+        self._open.core.advance_by(self.segmenter)
         self._open.confirm()
-        self._open.move(rest, self._segmenter.rest_forward)
+        self._open.core.move(rest)
         submap = self._open.solve(windows.gaussian)
         is_sensible = self._open.is_sensible(submap)
-        scans, self._scans = self._scans - self._segmenter.uncovered, self._segmenter.uncovered
+        uncovered = self.segmenter.uncovered
+        scans, self._scans = self._scans - uncovered, uncovered
         closed = ClosedWindow(
             sequence=self.sequence,
             first_measurement=self._first_measurement,
@@ -170,23 +165,27 @@ class HybridSlam:
                 slips=found.slips,
                 sightings=() if self._grid is None else self._grid.sightings(),
                 window=windows.of_base(self.window),
-                keyframes_ns=self._open.keyframes_ns,
+                keyframes_ns=tuple(self._open.core.keyframes_ns.tolist()),
                 innovation=self.window.innovation,
             )
         self._innovation = self._innovation.plus(closed.innovation)
-        self._start_ns = end_ns
-        self._segmenter.begin(end_ns)
+        self.segmenter.begin(end_ns)
+        if self._grid is not None:
+            self._grid.begin(end_ns)
         self._begin_window(self.sequence + 1, self.last_measurement + 1)
         return closed
 
     def _begin_window(self, sequence: int, first_measurement: int) -> None:
         self.sequence = sequence
         self._first_measurement, self.last_measurement = first_measurement, first_measurement - 1
-        self._driven_m = 0.0
-        self.last_keyframe_ns = None
         self._open = OpenWindow(self._config, self._incarnation, sequence)
 
     # The open window meanwhile.
+
+    @property
+    def last_keyframe_ns(self) -> int | None:
+        """Team time of the open window's last keyframe."""
+        return self._open.core.last_keyframe_ns
 
     @property
     def window(self) -> Window:
@@ -200,11 +199,11 @@ class HybridSlam:
         found = self._open.solve(windows.running)
         if found is None:
             alone = self._moved_alone()
-            found = RunningWindow(WholeMap(alone.ids, alone.mean, alone.covariance))
+            found = RunningWindow(core.WholeMap(alone.ids, alone.mean, alone.covariance))
         return found
 
     def _moved_alone(self) -> LocalMap:
-        return windows.motion_alone(self._open.motion)
+        return windows.motion_alone(Increment(*self._open.core.base_motion()))
 
     @property
     def innovation(self) -> Innovation:

@@ -24,8 +24,7 @@ from teamslam.team.estimation.inter_robot import (
     point_seen,
     reduced,
 )
-from teamslam.team.estimation.models import Increment, scanned
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.models import Increment, model_of, scanned
 from teamslam.team.rejection import Rejection
 from teamslam.team.shapes import Float
 
@@ -64,18 +63,18 @@ class _Look:
 
 
 class PoseGrid:
-    """The grid times of the open window and its inter-robot measurements.
-
-    next_ns: team time of the next of both, else NEVER_NS.
-    """
+    """The grid times of the open window and its inter-robot measurements: the segmenter's stops."""
 
     def __init__(
         self,
+        segmenter: core.Segmenter,
         sensor: Sensor,
         front_end: FrontEnd,
         gnss: Gnss = NO_GNSS,
         motion: MotionModel = NO_MOTION,
     ) -> None:
+        self._segmenter = segmenter
+        segmenter.stop_at(-NEVER_NS)  # at the stream's begin
         self._sensor = sensor
         self._motion = motion
         self._delay_ns = round(gnss.delay_s * 1e9)
@@ -85,15 +84,16 @@ class PoseGrid:
         self._near_ns = round(front_end.sighting_s * 1e9)
         self._window_ns = round(front_end.window_s * 1e9)
         self._teammate_speed = front_end.teammate_speed
-        self._begin_ns = self._node_ns = self._last_ns = 0
-        self.next_ns = NEVER_NS
+        self._node_ns = self._last_ns = 0
+        self._begin_ns, self._has_begun = 0, False
+        self._next_ns = NEVER_NS
         self._uncovered: list[_Look] = []
         self._ahead: list[_Look] = []
         self._at_node: dict[tuple[int, str], list[tuple[int, CarriedPoint]]] = {}
 
     def begin(self, stamp_ns: int) -> None:
         """Begin a window; its nodes are the grid times within window_s."""
-        self._begin_ns = stamp_ns
+        self._begin_ns, self._has_begun = stamp_ns, True
         self._node_ns = (stamp_ns // self._grid_ns + 1) * self._grid_ns
         self._last_ns = stamp_ns + self._window_ns
         self._uncovered, self._ahead, self._at_node, self._fixes = [], [], {}, {}
@@ -144,38 +144,45 @@ class PoseGrid:
 
     def _find_next(self) -> None:
         look_ns = self._uncovered[0].stamp_ns if self._uncovered else NEVER_NS
-        self.next_ns = min(look_ns, self._node_ns if self._node_ns <= self._last_ns else NEVER_NS)
+        self._next_ns = min(look_ns, self._node_ns if self._node_ns <= self._last_ns else NEVER_NS)
+        self._segmenter.stop_at(self._next_ns)
 
-    def reach(self, odometry: core.Odometry, over: OdometryInterval) -> bool:
-        """Note that the observer is at `next_ns`, in the interval `over`; return whether that is a
-        pose node (which comes before measurements).
-        """
-        is_node = self.next_ns == self._node_ns <= self._last_ns
-        if not is_node:
+    def pass_stops(self) -> None:
+        """Pass the nodes and inter-robot measurements of the segmenter's interval."""
+        while self._segmenter.is_stopped:
+            if not self._has_begun:
+                assert self._segmenter.start_ns is not None
+                self.begin(self._segmenter.start_ns)
+            else:
+                self._reach()
+            self._segmenter.go_on()
+
+    def _reach(self) -> None:
+        """Take the node or the measurement at the stop; a node comes before measurements."""
+        segmenter = self._segmenter
+        if self._next_ns == self._node_ns <= self._last_ns:
+            for look, since in zip(self._ahead, segmenter.reach_node(), strict=True):
+                self._keep(look, carry_on(look.seen, Increment(*since)))
+            self._ahead = []
+            self._node_ns += self._grid_ns
+        else:
             look = self._uncovered.pop(0)
             if look.fix is not None and self._delay_ns:
-                look = replace(look, seen=self._delayed_antenna(over))
+                look = replace(look, seen=self._delayed_antenna())
             if look.stamp_ns < look.node_ns:
                 self._ahead.append(look)
-                odometry.mark_sighting()
+                segmenter.mark_sighting()
             else:
-                since_node = Increment(*odometry.since_node())
+                since_node = Increment(*segmenter.since_node())
                 self._keep(look, carry_back(look.seen, since_node))
-            self._find_next()
-            return False
-        for look, since in zip(self._ahead, odometry.reach_node(), strict=True):
-            self._keep(look, carry_on(look.seen, Increment(*since)))
-        self._ahead = []
-        self._node_ns += self._grid_ns
         self._find_next()
-        return True
 
-    def _delayed_antenna(self, over: OdometryInterval) -> CarriedPoint:
+    def _delayed_antenna(self) -> CarriedPoint:
         """Place the antenna of a delayed fix in the robot's frame."""
-        lasting_ns = abs(self._delay_ns)
-        moved = over.gone_on(over.end_ns, lasting_ns).part(self._motion, lasting_ns, 0)
+        over, lasting_ns = self._segmenter.interval, abs(self._delay_ns)
+        moved = over.gone_on(over.end_ns, lasting_ns).part(model_of(self._motion), lasting_ns, 0)
         carry = carry_on if self._delay_ns > 0 else carry_back
-        return carry(self._antenna, moved)
+        return carry(self._antenna, Increment(*moved))
 
     def sightings(self) -> tuple[NodeSighting, ...]:
         """The window's inter-robot measurements and fixes that reached a node."""

@@ -19,11 +19,9 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.association.scans import Scans, points_of
 from teamslam.team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
 from teamslam.team.estimation.hybrid_slam.fastslam import effective_sample_size, normalise
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
-from teamslam.team.estimation.hybrid_slam.reduction import variances
 from teamslam.team.estimation.hybrid_slam.window import Window
 from teamslam.team.estimation.models import noise_of
-from teamslam.team.estimation.scans import POINT
+from teamslam.team.estimation.scans import POINT, variances
 from teamslam.team.estimation.se2 import adjoint, between, inverse
 from teamslam.team.shapes import Float, Int64
 
@@ -34,7 +32,7 @@ uncertainty, as of particles (`open_window.DEPLETED`).
 """
 
 
-def redraw_paths(window: Window, keyframes: Sequence[Keyframe], random: core.Random) -> None:
+def redraw_paths(window: Window, keyframes: Sequence[core.Keyframe], random: core.Random) -> None:
     """Draw the window's paths anew, if few lines of descent are left and the new ones are more.
 
     A sample counts by its effective size 1/Σ w², the particles by w summed over those of one pose
@@ -82,12 +80,12 @@ def _rows(values: Float[np.ndarray, "M L k"]) -> Float[np.ndarray, "M _"]:
     return np.ascontiguousarray(values).reshape(len(values), -1)
 
 
-def _scans(window: Window, keyframes: Sequence[Keyframe]) -> Scans:
+def _scans(window: Window, keyframes: Sequence[core.Keyframe]) -> Scans:
     ranges, bearings = window.measurements.T
     points, covariances = points_of(ranges, bearings, variances(ranges, window.own, window.sensor))
     return Scans(
-        motions=np.array([each.increment.mean for each in keyframes]),
-        motion_covariances=np.array([each.increment.covariance for each in keyframes]),
+        motions=np.array([each.motion[0] for each in keyframes]),
+        motion_covariances=np.array([each.motion[1] for each in keyframes]),
         keyframes=window.keyframes,
         points=points,
         covariances=covariances,

@@ -9,21 +9,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from msgspec.structs import replace
 
+from teamslam.team import core
 from teamslam.team.config import UNNAMED, AssociationSettings, Sensor
 from teamslam.team.estimation.association.clustering import associate_window
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, points_of
 from teamslam.team.estimation.association.tracking import Slip, slip_covariance
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
-from teamslam.team.estimation.hybrid_slam.reduction import (
-    KeyframeScan,
-    Measured,
-    reduced,
-    variances,
-)
 from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.scans import Own, together
+from teamslam.team.estimation.scans import Scan, variances
+from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 from teamslam.team.shapes import Bool, Int64
 
@@ -36,7 +30,7 @@ class AssociatedKeyframes:
     detections left out. slips: of the odometry. became: the outcome of each detection.
     """
 
-    keyframes: tuple[Keyframe, ...]
+    keyframes: tuple[core.Keyframe, ...]
     unnamed: Unnamed = NONE_UNNAMED
     gated: int = 0
     slips: tuple[Slipped, ...] = ()
@@ -46,18 +40,18 @@ class AssociatedKeyframes:
 class Event(NamedTuple):
     """An instant of a window: a scan without identities, or the end of a keyframe.
 
-    keyframe: its index. motion: since the event before.
+    keyframe: its index. motion: since the event before. look: of a scan without identities.
     """
 
     at_ns: int
     keyframe: int
     motion: Increment
-    look: KeyframeScan | None
-    named: Keyframe | None
+    scan: Scan
+    look: core.TimedScan | None = None
 
 
 def associate_keyframes(
-    keyframes: Sequence[Keyframe], settings: AssociationSettings, sensor: Sensor, most: int
+    keyframes: Sequence[core.Keyframe], settings: AssociationSettings, sensor: Sensor, most: int
 ) -> AssociatedKeyframes:
     """Associate the window's detections. Raises LinAlgError where it has no solution.
 
@@ -87,31 +81,30 @@ def associate_keyframes(
     )
 
 
-def events_of(keyframes: Sequence[Keyframe]) -> list[Event]:
+def events_of(keyframes: Sequence[core.Keyframe]) -> list[Event]:
     """List the scans and keyframe ends of a window by time; a keyframe that is only one scan is one
     event.
     """
     events = []
     for k, each in enumerate(keyframes):
-        events += [Event(x.at_ns, k, x.motion or Increment.identity(), x, None) for x in each.looks]
-        if each.rest is None or len(each.ids) or not _is_none(each.rest):
-            motion = each.increment if each.rest is None else each.rest
-            events.append(Event(each.stamp_ns, k, motion, None, each))
+        for look in each.looks:
+            since = Increment.identity() if look.motion is None else Increment(*look.motion)
+            events.append(Event(look.at_ns, k, since, look.scan, look))
+        rest = each.rest
+        if rest is None or len(each.scan) or any(part.any() for part in rest):
+            motion = Increment(*(each.motion if rest is None else rest))
+            events.append(Event(each.stamp_ns, k, motion, each.scan))
     return sorted(events, key=lambda event: event.at_ns)
-
-
-def _is_none(motion: Increment) -> bool:
-    return not motion.mean.any() and not motion.covariance.any()
 
 
 def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
     """Convert the window's detections to points with covariances."""
-    seen = [_measurements_of(event) for event in events]
-    counts = [len(ids) for ids, *_ in seen]
-    ids = np.concatenate([ids for ids, *_ in seen]).astype(np.int64)
-    ranges = np.concatenate([ranges for _, ranges, *_ in seen])
-    bearings = np.concatenate([bearings for *_, bearings, _ in seen])
-    noises = np.concatenate([variances(ranges, own, sensor) for _, ranges, _, own in seen])
+    seen = [event.scan for event in events]
+    counts = [len(scan) for scan in seen]
+    ids = np.concatenate([scan.ids for scan in seen]).astype(np.int64)
+    ranges = np.concatenate([scan.ranges for scan in seen])
+    bearings = np.concatenate([scan.bearings for scan in seen])
+    noises = np.concatenate([variances(scan.ranges, scan.own, sensor) for scan in seen])
     points, covariances = points_of(ranges, bearings, noises)
     return Scans(
         motions=np.array([event.motion.mean for event in events]),
@@ -123,80 +116,62 @@ def scans_of(events: Sequence[Event], sensor: Sensor) -> Scans:
     )
 
 
-def _measurements_of(event: Event) -> Measured:
-    source = event.named if event.look is None else event.look
-    assert source is not None
-    return source.ids, source.ranges, source.bearings, source.own
-
-
 def _list_outcomes(
     events: Sequence[Event], landmarks: Int64[np.ndarray, " n"], clutter: Bool[np.ndarray, " n"]
 ) -> Became:
     looks = [event.look for event in events if event.look is not None]
     return Became(
         stamps=np.array([each.stamp_ns for each in looks], np.int64),
-        counts=np.array([len(each.ids) for each in looks], np.int64),
-        rows=np.concatenate([each.ids for each in looks]).astype(np.int64) - UNNAMED,
+        counts=np.array([len(each.scan) for each in looks], np.int64),
+        rows=np.concatenate([each.scan.ids for each in looks]).astype(np.int64) - UNNAMED,
         landmarks=landmarks,
         clutter=clutter,
     )
 
 
 def _number_keyframes(
-    keyframes: Sequence[Keyframe],
+    keyframes: Sequence[core.Keyframe],
     events: Sequence[Event],
     numbers: Int64[np.ndarray, " n"],
     slips: tuple[Slip, ...],
-) -> tuple[Keyframe, ...]:
+) -> tuple[core.Keyframe, ...]:
     """Add the scans' detections to their keyframes under landmark numbers (0: left out), one
     measurement per landmark; a motion that slipped gets a larger covariance.
     """
-    looks: dict[int, list[KeyframeScan]] = {}
+    looks: dict[int, list[tuple[Scan, Pose | None]]] = {}
     first = 0
     for event in events:
         if event.look is not None:
-            own = numbers[first : first + len(event.look.ids)]
-            looks.setdefault(event.keyframe, []).append(_select_numbered(event.look, own))
-            first += len(event.look.ids)
+            own = numbers[first : first + len(event.scan)]
+            numbered = _select_numbered(event.scan, own)
+            looks.setdefault(event.keyframe, []).append((numbered, event.look.back))
+            first += len(event.scan)
     slipped = {events[slip.keyframe].keyframe: slip_covariance(slip.by) for slip in slips}
     out = []
     for k, each in enumerate(keyframes):
-        keyframe = each
+        scan, (mean, covariance) = each.scan, each.motion
         if k in looks:
-            keyframe = _add_measurements(keyframe, _reduce_scans(looks[k]))
+            scan = scan.together(_reduce_scans(looks[k]))
         if k in slipped:
-            motion = Increment(each.increment.mean, each.increment.covariance + slipped[k])
-            keyframe = replace(keyframe, increment=motion)
-        out.append(replace(keyframe, looks=(), rest=None))
+            covariance = covariance + slipped[k]
+        out.append(
+            core.Keyframe(
+                each.stamp_ns, (mean, covariance), scan, is_node=each.is_node, shift=each.shift
+            )
+        )
     return tuple(out)
 
 
-def _select_numbered(look: KeyframeScan, numbers: Int64[np.ndarray, " n"]) -> KeyframeScan:
+def _select_numbered(scan: Scan, numbers: Int64[np.ndarray, " n"]) -> Scan:
     has_number = numbers > 0
-    return replace(
-        look,
-        ids=numbers[has_number].astype(np.uint32),
-        ranges=look.ranges[has_number],
-        bearings=look.bearings[has_number],
-        own=look.own[has_number],
-    )
+    chosen = scan.only(has_number)
+    named = numbers[has_number].astype(np.uint32)
+    return Scan(named, chosen.ranges, chosen.bearings, chosen.own)
 
 
-def _reduce_scans(looks: Sequence[KeyframeScan]) -> Measured:
+def _reduce_scans(looks: Sequence[tuple[Scan, Pose | None]]) -> Scan:
     """Reduce a keyframe's scans to its end; a scan that is the keyframe stays."""
-    if len(looks) == 1 and looks[0].back is None:
-        (look,) = looks
-        return look.ids, look.ranges, look.bearings, look.own
-    return reduced([(look, np.zeros(3) if look.back is None else look.back) for look in looks])
-
-
-def _add_measurements(keyframe: Keyframe, seen: Measured) -> Keyframe:
-    ids, ranges, bearings, own = seen
-    parts: list[tuple[int, Own]] = [(len(keyframe.ids), keyframe.own), (len(ids), own)]
-    return replace(
-        keyframe,
-        ids=np.concatenate((keyframe.ids, ids)),
-        ranges=np.concatenate((keyframe.ranges, ranges)),
-        bearings=np.concatenate((keyframe.bearings, bearings)),
-        own=together(parts),
-    )
+    if len(looks) == 1 and looks[0][1] is None:
+        return looks[0][0]
+    poses = np.array([np.zeros(3) if back is None else back for _, back in looks])
+    return core.reduce_scans([scan for scan, _ in looks], poses)

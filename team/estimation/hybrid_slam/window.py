@@ -6,6 +6,7 @@ noisiest measurement, a bias common to many submaps. Brooks and Bailey 2009, Hyb
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import msgspec
@@ -16,10 +17,11 @@ from teamslam.team.config import BIASES, Bias, FrontEnd, Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import FAULTS, CoreErrors, NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.models import Increment, noise_of
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import tangent
-from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.estimation.submap import Became, LocalMap, Slipped
 from teamslam.team.shapes import Float, Int64, UInt32
 
 STILL = np.zeros(4)
@@ -111,6 +113,34 @@ class Window(msgspec.Struct, gc=False):
     def landmarks(self) -> UInt32[np.ndarray, " L"]:
         """The landmarks in order of first sight."""
         return self.core.ids()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedWindow:
+    """A submap with the names of its inputs, and the inter-robot measurements from its pose nodes.
+
+    window, keyframes_ns: its particles with their paths, and the keyframes' team times, if solved.
+    innovation: of predicted measurements. gated: measurements that no others confirmed. late:
+    rejected scans, stamped behind the window's end. became: outcomes of detections without
+    identity. slips: motions that the odometry missed. unsolved: scans without a Gaussian, of which
+    the submap has only the motion.
+    """
+
+    sequence: int
+    first_measurement: int
+    last_measurement: int
+    start_ns: int
+    end_ns: int
+    local: LocalMap
+    sightings: tuple[NodeSighting, ...] = ()
+    window: Window | None = None
+    keyframes_ns: tuple[int, ...] = ()
+    innovation: Innovation = NOTHING
+    gated: int = 0
+    late: int = 0
+    unsolved: int = 0
+    became: Became | None = None
+    slips: tuple[Slipped, ...] = ()
 
 
 def open_window(front_end: FrontEnd, sensor: Sensor) -> Window:

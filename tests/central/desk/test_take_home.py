@@ -21,7 +21,7 @@ from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.sim.in_memory.team import run_team
 from teamslam.team.datum import Datum
-from teamslam.team.estimation.hybrid_slam.closed_window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.geodesy import local_from_geodetic
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample

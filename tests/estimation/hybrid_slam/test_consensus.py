@@ -11,7 +11,7 @@ from teamslam.sim.world.streams import WorldStreams
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation.models import Increment, increment_of, noise_of, predicted
-from teamslam.team.estimation.scans import point_scan, polar_scan, unclaimed
+from teamslam.team.estimation.scans import Scan, unclaimed
 from teamslam.team.estimation.se2 import compose
 from tests.scenarios import with_world
 
@@ -102,9 +102,11 @@ def test_measurements_are_judged_by_the_covariances_that_they_claim(points):
             C = np.column_stack(
                 [rr * c * c + across * s * s, (rr - across) * c * s, rr * s * s + across * c * c]
             )
-            own = point_scan(window.ids, np.column_stack([r * c, r * s]), C).own
+            places = np.column_stack([r * c, r * s])
+            own = Scan.points(window.ids.tobytes(), places.tobytes(), C.tobytes()).own
         else:
-            own = polar_scan(window.ids, r, b, np.column_stack([rr, 0 * rr, bb])).own
+            parts = window.ids, r, b, np.column_stack([rr, 0 * rr, bb])
+            own = Scan.polar(*(part.tobytes() for part in parts)).own
         taken[name] = window.judged(own=own)
     assert taken["those"].all()
     assert not taken["narrow"][few].any()

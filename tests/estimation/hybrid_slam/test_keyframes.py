@@ -6,10 +6,11 @@ from hypothesis import strategies as st
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.core import Scan
 from teamslam.team.estimation import se2
-from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.models import Increment, increment_of, located
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.odometry import OdometryInterval, segmenter_of
+from teamslam.team.rejection import BY_CORE, Rejection
 from tests.core.test_odometry import shift_of
 
 SECOND = 1_000_000_000
@@ -18,19 +19,25 @@ WHITE = MotionModel(
     turn=MotionNoise(per_s=0.03, per_m=0.02, per_rad=0.1),
     final_turn=MotionNoise(per_s=0.01),
 )
-NOTHING = (np.empty(0, np.uint32), np.empty(0), np.empty(0))
+NOTHING = Scan(np.empty(0, np.uint32), np.empty(0), np.empty(0))
 
 
 def scan(*rows):
     ids, ranges, bearings = zip(*rows, strict=True)
-    return np.array(ids, np.uint32), np.array(ranges, float), np.array(bearings, float)
+    return Scan(np.array(ids, np.uint32), np.array(ranges, float), np.array(bearings, float))
+
+
+def driven(segmenter, *interval):
+    """Keyframes of an interval."""
+    segmenter.drive(*interval)
+    return segmenter.take_keyframes()
 
 
 def total(keyframes, rest):
     motion = Increment.identity()
     for keyframe in keyframes:
-        motion = motion.then(keyframe.increment)
-    return motion.then(rest)
+        motion = motion.then(Increment(*keyframe.motion))
+    return motion.then(Increment(*rest.motion))
 
 
 @settings(deadline=None, max_examples=60)
@@ -40,15 +47,15 @@ def total(keyframes, rest):
     st.floats(-1.5, 1.5),
 )
 def test_observations_within_an_interval_split_its_mean_exactly(cuts, forward, yaw_rate):
-    split, whole = (Segmenter(WHITE, Sensor(), 0.0) for _ in range(2))
+    split, whole = (segmenter_of(WHITE, Sensor(), 0.0) for _ in range(2))
     for segmenter in (split, whole):
         segmenter.begin(0)
     for cut in sorted(cuts):
-        assert split.observe(cut, *NOTHING) is None
-    keyframes = split.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
-    whole.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
+        assert split.observe(cut, NOTHING) == 0
+    keyframes = driven(split, SECOND, SECOND, forward, yaw_rate)
+    whole.drive(SECOND, SECOND, forward, yaw_rate)
     assert [keyframe.stamp_ns for keyframe in keyframes] == sorted(cuts)
-    motion, expected = total(keyframes, split.cut(SECOND)[1]), whole.cut(SECOND)[1]
+    motion, expected = total(keyframes, split.cut(SECOND)), total([], whole.cut(SECOND))
     np.testing.assert_allclose(motion.mean, expected.mean, atol=1e-9)
 
 
@@ -58,54 +65,55 @@ def test_splitting_a_straight_interval_keeps_the_covariance_of_white_noise_forwa
     only_forward = MotionModel(forward=MotionNoise(per_s=0.05, per_m=0.1))
     heading = MotionModel(final_turn=MotionNoise(per_s=0.05))
     for motion, row in ((only_forward, 0), (heading, 2)):
-        segmenter = Segmenter(motion, Sensor(), 0.0)
+        segmenter = segmenter_of(motion, Sensor(), 0.0)
         segmenter.begin(0)
         for cut in sorted(cuts):
-            segmenter.observe(cut, *NOTHING)
-        keyframes = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, 0.0))
-        found = total(keyframes, segmenter.cut(SECOND)[1]).covariance
+            segmenter.observe(cut, NOTHING)
+        keyframes = driven(segmenter, SECOND, SECOND, forward, 0.0)
+        found = total(keyframes, segmenter.cut(SECOND)).covariance
         density = motion.forward if row == 0 else motion.final_turn
         expected = density.per_s**2 + density.per_m**2 * abs(forward)
         assert found[row, row] == pytest.approx(expected, abs=1e-9)
 
 
 def test_an_observation_waits_for_the_odometry_that_covers_it():
-    segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
+    segmenter = segmenter_of(MotionModel(), Sensor(), 0.0)
     segmenter.begin(0)
-    segmenter.observe(3 * SECOND // 2, *scan((4, 2.0, 0.0)))
-    assert segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0)) == []
+    segmenter.observe(3 * SECOND // 2, scan((4, 2.0, 0.0)))
+    assert driven(segmenter, SECOND, SECOND, 1.0, 0.0) == []
     assert segmenter.uncovered == 1
-    (keyframe,) = segmenter.drive(OdometryInterval(2 * SECOND, SECOND, 1.0, 0.0))
+    (keyframe,) = driven(segmenter, 2 * SECOND, SECOND, 1.0, 0.0)
     assert (keyframe.stamp_ns, segmenter.uncovered) == (3 * SECOND // 2, 0)
-    np.testing.assert_allclose(keyframe.increment.mean, [1.5, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(keyframe.motion[0], [1.5, 0.0, 0.0], atol=1e-12)
 
 
 def test_an_observation_before_the_odometry_is_taken_where_the_robot_stood():
-    segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
-    assert segmenter.observe(-SECOND, *scan((4, 2.0, 0.0))) is None
+    segmenter = segmenter_of(MotionModel(), Sensor(), 0.0)
+    assert segmenter.observe(-SECOND, scan((4, 2.0, 0.0))) == 0
     segmenter.begin(0)
-    (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0))
+    (keyframe,) = driven(segmenter, SECOND, SECOND, 1.0, 0.0)
     assert keyframe.stamp_ns == 0
-    assert not keyframe.increment.mean.any()
+    assert not keyframe.motion[0].any()
 
 
 def test_an_observation_of_a_time_that_is_past_is_rejected_with_its_reason():
-    segmenter = Segmenter(MotionModel(), Sensor(), 0.0)
+    segmenter = segmenter_of(MotionModel(), Sensor(), 0.0)
     segmenter.begin(0)
-    segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0))
-    assert segmenter.observe(SECOND - 1, *scan((4, 2.0, 0.0))) == "older than the odometry"
-    assert segmenter.observe(SECOND, *scan((4, 2.0, 0.0))) is None
+    segmenter.drive(SECOND, SECOND, 1.0, 0.0)
+    assert BY_CORE[segmenter.observe(SECOND - 1, scan((4, 2.0, 0.0)))] is Rejection.OLDER
+    assert segmenter.observe(SECOND, scan((4, 2.0, 0.0))) == 0
 
 
 def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
     sensor = Sensor(min_range=1.0, max_range=9.0, range_offset=0.5, range_scale=2.0)
-    segmenter = Segmenter(MotionModel(), sensor, 0.0)
+    segmenter = segmenter_of(MotionModel(), sensor, 0.0)
     segmenter.begin(0)
-    outside = segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 9.1, 0.0)))
-    assert outside == "outside the sensor's limits"
-    segmenter.observe(SECOND, *scan((1, 0.9, 0.0), (2, 4.5, 0.25)))
-    (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0))
-    assert (keyframe.ids.tolist(), keyframe.ranges.tolist(), keyframe.bearings.tolist()) == (
+    outside = segmenter.observe(SECOND, scan((1, 0.9, 0.0), (2, 9.1, 0.0)))
+    assert BY_CORE[outside] is Rejection.SENSOR_LIMITS
+    segmenter.observe(SECOND, scan((1, 0.9, 0.0), (2, 4.5, 0.25)))
+    (keyframe,) = driven(segmenter, SECOND, SECOND, 1.0, 0.0)
+    seen = keyframe.scan
+    assert (seen.ids.tolist(), seen.ranges.tolist(), seen.bearings.tolist()) == (
         [2],
         [2.0],
         [0.25],
@@ -113,12 +121,12 @@ def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
 
 
 def keyframe(scans, forward=0.0, yaw_rate=0.0):
-    segmenter = Segmenter(MotionModel(), Sensor(), 1.0)
+    segmenter = segmenter_of(MotionModel(), Sensor(), 1.0)
     segmenter.begin(0)
     for stamp_ns, rows in scans:
-        segmenter.observe(stamp_ns, *rows)
-    (keyframe,) = segmenter.drive(OdometryInterval(SECOND, SECOND, forward, yaw_rate))
-    return keyframe
+        segmenter.observe(stamp_ns, rows)
+    (keyframe,) = driven(segmenter, SECOND, SECOND, forward, yaw_rate)
+    return keyframe.scan
 
 
 @settings(deadline=None, max_examples=40)
@@ -155,48 +163,51 @@ def test_the_median_of_bearings_beside_the_cut_at_pi_lies_beside_it_too():
 
 
 def test_a_cut_closes_the_keyframe_and_the_next_window_starts_clean():
-    segmenter = Segmenter(MotionModel(), Sensor(), 5.0)
+    segmenter = segmenter_of(MotionModel(), Sensor(), 5.0)
     segmenter.begin(0)
-    segmenter.observe(SECOND // 2, *scan((7, 5.0, 0.0)))
-    assert segmenter.drive(OdometryInterval(SECOND, SECOND, 1.0, 0.0)) == []
-    (keyframe,), rest = segmenter.cut(SECOND)
-    assert (keyframe.stamp_ns, keyframe.ids.tolist()) == (SECOND, [7])
-    np.testing.assert_allclose(keyframe.ranges, [4.5])
-    assert not rest.mean.any()
-    assert segmenter.drive(OdometryInterval(2 * SECOND, SECOND, 1.0, 0.0)) == []
-    keyframes, rest = segmenter.cut(2 * SECOND)
-    assert keyframes == []
-    np.testing.assert_allclose(rest.mean, [1.0, 0.0, 0.0])
+    segmenter.observe(SECOND // 2, scan((7, 5.0, 0.0)))
+    assert driven(segmenter, SECOND, SECOND, 1.0, 0.0) == []
+    rest = segmenter.cut(SECOND)
+    (keyframe,) = segmenter.take_keyframes()
+    assert (keyframe.stamp_ns, keyframe.scan.ids.tolist()) == (SECOND, [7])
+    np.testing.assert_allclose(keyframe.scan.ranges, [4.5])
+    assert not rest.motion[0].any()
+    assert driven(segmenter, 2 * SECOND, SECOND, 1.0, 0.0) == []
+    rest = segmenter.cut(2 * SECOND)
+    assert segmenter.take_keyframes() == []
+    np.testing.assert_allclose(rest.motion[0], [1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("kind", ["velocity", "turn-then-drive"])
 def test_a_run_of_intervals_is_one_after_the_other_to_the_bit(kind):
     motion = msgspec.structs.replace(WHITE, kind=kind, calibrated_speed=(0.2, 0.3))
-    segmenter, expected, shift = Segmenter(motion, Sensor(), 0.0), Increment.identity(), np.zeros(3)
+    segmenter = segmenter_of(motion, Sensor(), 0.0)
+    expected, shift = Increment.identity(), np.zeros(3)
     segmenter.begin(0)
     for k in range(1, 30):
         speeds = 0.7 * np.sin(0.3 * k), np.cos(0.7 * k) * (k % 5 > 0)
-        segmenter.drive(OdometryInterval(k * SECOND, SECOND, *map(float, speeds)))
+        segmenter.drive(k * SECOND, SECOND, *map(float, speeds))
         step = increment_of(motion, 1.0, *map(float, speeds))
         own = shift_of(motion, (1.0, *map(float, speeds)))[:3]
         shift = se2.adjoint(se2.inverse(step.mean)) @ shift + own
         expected = expected.then(step)
-    found = segmenter.cut(29 * SECOND)[1]
-    np.testing.assert_array_equal(found.mean, expected.mean)
-    np.testing.assert_array_equal(found.covariance, expected.covariance)
-    np.testing.assert_allclose(segmenter.rest_forward, [*shift, 29.0], rtol=1e-12, atol=1e-14)
+    rest = segmenter.cut(29 * SECOND)
+    mean, covariance = rest.motion
+    np.testing.assert_array_equal(mean, expected.mean)
+    np.testing.assert_array_equal(covariance, expected.covariance)
+    np.testing.assert_allclose(rest.shift, [*shift, 29.0], rtol=1e-12, atol=1e-14)
 
 
 def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_to_the_bit():
-    segmenter = Segmenter(WHITE, Sensor(), 100.0)
+    segmenter = segmenter_of(WHITE, Sensor(), 100.0)
     segmenter.begin(0)
     durations = np.array([10, 7, 10, 10, 3, 10]) * (SECOND // 10)
     ends = np.cumsum(durations + np.array([5, 0, 0, 8, 0, 0]) * (SECOND // 10))
     columns = ends, durations, np.linspace(0.3, 0.8, 6), np.linspace(-0.4, 0.5, 6)
-    run = [OdometryInterval(*each) for each in zip(*map(np.ndarray.tolist, columns), strict=True)]
+    run = list(zip(*map(np.ndarray.tolist, columns), strict=True))
     stamps = sorted([1, int(ends[0]), SECOND, SECOND, int(ends[2]) + 5, int(ends[5]) - 1])
     poses, pose = [], np.zeros(3)
-    for end, duration, forward, yaw_rate, _ in map(msgspec.structs.astuple, run):
+    for end, duration, forward, yaw_rate in run:
         here = end - duration
         for until in (*(s for s in stamps[len(poses) :] if s <= end), None):
             part = (end if until is None else max(until, here)) - here
@@ -206,10 +217,11 @@ def test_scans_in_a_run_of_intervals_are_seen_from_where_the_odometry_had_come_t
             if until is not None:
                 poses.append(pose)
     for k, stamp in enumerate(stamps):
-        assert segmenter.observe(stamp, *scan((k, 4.0 + k, 0.2 * k))) is None
+        assert segmenter.observe(stamp, scan((k, 4.0 + k, 0.2 * k))) == 0
     for each in run:
-        assert segmenter.drive(each) == []
-    (found,), _ = segmenter.cut(int(ends[-1]))
+        assert driven(segmenter, OdometryInterval(*each)) == []
+    segmenter.cut(int(ends[-1]))
+    found = segmenter.take_keyframes()[0].scan
     assert found.ids.tolist() == list(range(6))
     for k, at in enumerate(poses):
         x, y = located(se2.between(pose, at), 4.0 + k, 0.2 * k)

@@ -1,4 +1,3 @@
-from collections.abc import Sequence
 from dataclasses import replace
 
 import msgspec
@@ -11,7 +10,6 @@ from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
@@ -59,13 +57,14 @@ def test_a_submap_is_as_if_the_outliers_had_never_been_measured():
 
 
 def test_of_clean_measurements_none_is_gated_and_each_window_is_computed_once(monkeypatch):
-    taken = OpenWindow._take_all
+    confirm, particles = OpenWindow.confirm, config().front_end.particles
 
-    def again(window: OpenWindow, keyframes: Sequence[Keyframe], times: int = 1) -> None:
-        assert times > 1, "computed again, and not with more particles"
-        taken(window, keyframes, times)
+    def counted(window: OpenWindow) -> None:
+        confirm(window)
+        with_more = len(window.particles.particles.poses) > particles
+        assert window.core.restarts == with_more, "computed again, and not with more particles"
 
-    monkeypatch.setattr(OpenWindow, "_take_all", again)
+    monkeypatch.setattr(OpenWindow, "confirm", counted)
     assert sum(s.gated for s in submaps(config(), published(stream("r1", 20)))) == 0
 
 

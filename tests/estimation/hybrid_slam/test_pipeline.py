@@ -7,13 +7,12 @@ from hypothesis import strategies as st
 
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
+from teamslam.team.core import Keyframe, Scan
 from teamslam.team.estimation.hybrid_slam import window as windows
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.models import Increment, increment_of, predicted
+from teamslam.team.estimation.models import increment_of, predicted
 from teamslam.team.estimation.odometry import OdometryInterval
-from teamslam.team.estimation.scans import polar_scan
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.wire import messages as m
 from tests import build
@@ -155,7 +154,7 @@ def closed(mount=MOUNT, sensor_mount=MOUNT, biases=(), shift: float = 0.0):
     for k in range(1, 9):
         pose = compose(pose, increment_of(STEADY, 1.0, 1.0, 0.2).mean)
         z = np.array([predicted(compose(pose, np.array(mount)), p) for p in PLACES])
-        scan = polar_scan(np.arange(3, dtype=np.uint32), z[:, 0], z[:, 1] + shift)
+        scan = Scan(np.arange(3, dtype=np.uint32), z[:, 0], z[:, 1] + shift)
         slam.observe(k * SECOND, scan)
         slam.drive(OdometryInterval(k * SECOND, SECOND, 1.0, 0.2))
     return slam.finish()[0].local, pose
@@ -185,11 +184,11 @@ def test_the_derivative_by_a_bias_is_that_of_the_bases_submap(mount):
 def test_a_keyframe_that_is_no_gaussian_leaves_a_window_without_solution(variance, range_m):
     window = OpenWindow(config(), 1, 0)
     ids, bearings = np.array([3], np.uint32), np.zeros(1)
-    still = Increment(np.zeros(3), 1e-4 * np.eye(3))
-    window.advance(Keyframe(1, still, ids, np.array([2.0]), bearings))
+    still = np.zeros(3), 1e-4 * np.eye(3)
+    window.core.advance(Keyframe(1, still, Scan(ids, np.array([2.0]), bearings)))
     assert window.solve(windows.running) is not None
-    moved = Increment(np.zeros(3), variance * np.eye(3))
-    window.advance(Keyframe(2, moved, ids, np.array([range_m]), bearings))
+    moved = np.zeros(3), variance * np.eye(3)
+    window.core.advance(Keyframe(2, moved, Scan(ids, np.array([range_m]), bearings)))
     assert window.solve(windows.running) is None
     window.confirm()
     assert window.solve(windows.gaussian) is None

@@ -8,13 +8,12 @@ from teamslam.team import core
 from teamslam.team.config import FrontEnd, Gnss, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import POSE_JITTER
 from teamslam.team.estimation.hybrid_slam import window as windows
-from teamslam.team.estimation.hybrid_slam.keyframes import Segmenter
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
 from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.map_joining.conditioning import SubmapCorrection
 from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.odometry import OdometryInterval
+from teamslam.team.estimation.odometry import OdometryInterval, segmenter_of
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 
@@ -24,9 +23,10 @@ FRONT = FrontEnd(node_s=2.0, window_s=7.0, sighting_s=1.0, teammate_speed=0.0)
 
 
 def initial_state(front=FRONT, sensor=None, keyframe_s=0.0, at_ns=0):
-    grid = PoseGrid(sensor or Sensor(), front)
-    segmenter = Segmenter(MOTION, sensor or Sensor(), keyframe_s, grid)
+    segmenter = segmenter_of(MOTION, sensor or Sensor(), keyframe_s)
+    grid = PoseGrid(segmenter, sensor or Sensor(), front)
     segmenter.begin(at_ns)
+    grid.begin(at_ns)
     return grid, segmenter
 
 
@@ -34,11 +34,14 @@ def look(teammate="r2", distance=3.0, bearing=0.5):
     return (teammate,), np.array([distance]), np.array([bearing])
 
 
-def drive(segmenter, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
+def drive(segmenter, grid, until_s, step_ns=SECOND, forward=0.6, yaw_rate=0.25):
     keyframes, now = [], segmenter.now_ns
     while now < round(until_s * SECOND):
         now += step_ns
-        keyframes += segmenter.drive(OdometryInterval(now, step_ns, forward, yaw_rate))
+        segmenter.drive(now, step_ns, forward, yaw_rate)
+        if grid is not None:
+            grid.pass_stops()
+        keyframes += segmenter.take_keyframes()
     return keyframes
 
 
@@ -52,22 +55,23 @@ def arc(seconds, forward=0.6, yaw_rate=0.25):
 @given(st.lists(st.integers(0, 7 * SECOND - 1), max_size=5), st.sampled_from([0.0, 0.5]))
 def test_no_motion_is_lost_or_counted_twice_at_nodes_and_sightings(stamps, keyframe_s):
     grid, with_nodes = initial_state(keyframe_s=keyframe_s)
-    plain = Segmenter(MOTION, Sensor(), keyframe_s)
+    plain = segmenter_of(MOTION, Sensor(), keyframe_s)
     plain.begin(0)
-    scan = (np.array([1], np.uint32), np.array([2.0]), np.array([0.0]))
+    scan = core.Scan(np.array([1], np.uint32), np.array([2.0]), np.array([0.0]))
     for counter, stamp in enumerate(sorted(stamps)):
         grid.observe(stamp, counter, look())
         for segmenter in (with_nodes, plain):
-            segmenter.observe(stamp, *scan)
+            segmenter.observe(stamp, scan)
     ends = []
-    for segmenter in (with_nodes, plain):
-        keyframes = drive(segmenter, 7.0)
-        rest, more = segmenter.cut(7 * SECOND)[::-1]
+    for segmenter, at in ((with_nodes, grid), (plain, None)):
+        keyframes = drive(segmenter, at, 7.0)
+        rest = segmenter.cut(7 * SECOND)
+        keyframes += segmenter.take_keyframes()
         total = Increment.identity()
-        for keyframe in (*keyframes, *more):
-            total = total.then(keyframe.increment)
-        ends.append(total.then(rest))
-        assert sum(len(each.ids) for each in (*keyframes, *more)) > 0 or not stamps
+        for keyframe in (*keyframes, rest):
+            total = total.then(Increment(*keyframe.motion))
+        ends.append(total)
+        assert sum(len(each.scan) for each in keyframes) > 0 or not stamps
     np.testing.assert_allclose(ends[0].mean, ends[1].mean, atol=1e-9)
 
 
@@ -78,7 +82,7 @@ def test_a_sighting_is_carried_along_the_arc_to_its_node(at_s, distance, bearing
     observer = arc(at_s)
     point = observer[0] + 1j * observer[1] + distance * np.exp(1j * (observer[2] + bearing))
     assert grid.observe(round(at_s * SECOND), 5, look("r2", distance, bearing)) is None
-    drive(segmenter, 4.0, 250_000_000)
+    drive(segmenter, grid, 4.0, 250_000_000)
     (found,) = grid.sightings()
     to = seen_from(arc(2.0), point)
     assert (found.stamp_ns, found.teammate, found.measurements) == (2 * SECOND, "r2", (5,))
@@ -93,7 +97,7 @@ def test_a_teammate_that_may_move_is_known_less_well_the_farther_its_node_is_in_
     for at_ns in (2 * SECOND, 2_500_000_000, 3 * SECOND - 1):
         grid, segmenter = initial_state(moving)
         grid.observe(at_ns, 1, look())
-        drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
+        drive(segmenter, grid, 4.0, forward=0.0, yaw_rate=0.0)
         variances.append(grid.sightings()[0].covariance[0, 0])
     assert variances[1] - variances[0] == pytest.approx(0.25**2, abs=0.01)
     assert variances[2] - variances[0] == pytest.approx(0.5**2, abs=0.01)
@@ -104,7 +108,7 @@ def test_looks_at_one_teammate_near_one_node_are_one_sighting_of_the_median():
     for counter, (at_s, distance) in enumerate([(1.6, 3.0), (1.9, 3.1), (2.2, 9.0), (2.4, 3.2)]):
         grid.observe(round(at_s * SECOND), counter, look("r3", distance))
     grid.observe(2_300_000_000, 9, look("r2", 5.0))
-    drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
+    drive(segmenter, grid, 4.0, forward=0.0, yaw_rate=0.0)
     first, second = grid.sightings()
     assert (first.teammate, first.measurements, first.measurement[0]) == ("r2", (9,), 5.0)
     assert (second.teammate, second.measurements) == ("r3", (0, 1, 2, 3))
@@ -116,7 +120,7 @@ def test_the_sensors_calibration_and_the_markers_offset_are_taken_off():
     grid, segmenter = initial_state(sensor=sensor)
     looks = (("r2", "r3", "r4"), np.array([4.1, 9.5, 0.9]), np.zeros(3))
     assert grid.observe(2 * SECOND, 1, looks) is None
-    drive(segmenter, 4.0, forward=0.0, yaw_rate=0.0)
+    drive(segmenter, grid, 4.0, forward=0.0, yaw_rate=0.0)
     (found,) = grid.sightings()
     assert (found.teammate, found.measurement[0]) == ("r2", pytest.approx(1.5))
     assert grid.observe(4 * SECOND, 2, look("r3", 9.5)) == "outside the sensor's limits"
@@ -149,7 +153,7 @@ def test_measurements_that_arrive_out_of_order_are_used_at_their_times():
         grid, segmenter = initial_state()
         for stamp_ns in order:
             grid.observe(stamp_ns, stamp_ns // 10**8, look())
-        drive(segmenter, 6.0)
+        drive(segmenter, grid, 6.0)
         found.append(grid.sightings())
     (one,), (other,) = found
     assert one.measurements == other.measurements == (18, 25)
@@ -217,12 +221,14 @@ def test_a_delayed_fix_is_of_the_antenna_where_it_was_by_the_delay_before_its_st
     delay_s, fixed_s
 ):
     antenna = np.array([0.8, -0.5])
-    grid = PoseGrid(Sensor(), FRONT, Gnss(antenna=tuple(antenna), delay_s=delay_s), MOTION)
-    segmenter = Segmenter(MOTION, Sensor(), 0.0, grid)
+    segmenter = segmenter_of(MOTION, Sensor(), 0.0)
+    gnss = Gnss(antenna=tuple(antenna), delay_s=delay_s)
+    grid = PoseGrid(segmenter, Sensor(), FRONT, gnss, MOTION)
     segmenter.begin(0)
+    grid.begin(0)
     position = CarriedPoint(np.array([10.0, 20.0]), np.eye(2))
     assert grid.fix(round(fixed_s * SECOND), 3, position) is None
-    drive(segmenter, 5.0, 100_000_000)
+    drive(segmenter, grid, 5.0, 100_000_000)
     (found,) = grid.sightings()
     (x, y, turn), (x0, y0, turn0) = arc(fixed_s - delay_s), arc(2.0)
     true = x + 1j * y + complex(*antenna) * np.exp(1j * turn)

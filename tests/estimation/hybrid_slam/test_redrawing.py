@@ -6,14 +6,11 @@ from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
+from teamslam.team.core import Keyframe, Scan, TimedScan
 from teamslam.team.estimation.hybrid_slam import open_window
-from teamslam.team.estimation.hybrid_slam.keyframes import Keyframe
 from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.hybrid_slam.reduction import KeyframeScan
 from teamslam.team.estimation.hybrid_slam.window import gaussian
-from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.scans import unclaimed
 from teamslam.team.estimation.se2 import between, compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.wire import messages as m
@@ -55,6 +52,7 @@ SECOND = 10**9
 STEPS, REACH = 40, 5.0
 SENSOR = Sensor(range_sigma=0.01, bearing_sigma=0.005)
 SPREAD = np.array([0.08, 0.06, 0.05])
+STILL = np.zeros(3), np.zeros((3, 3))
 
 
 def drive(seed: int) -> tuple[list[Keyframe], np.ndarray]:
@@ -67,9 +65,7 @@ def drive(seed: int) -> tuple[list[Keyframe], np.ndarray]:
     )
     for k in range(1, STEPS + 1):
         after = compose(pose, np.array([0.5, 0.0, 0.5 / 12.0]))
-        motion = Increment(
-            between(pose, after) + SPREAD * random.standard_normal(3), np.diag(SPREAD**2)
-        )
+        motion = between(pose, after) + SPREAD * random.standard_normal(3), np.diag(SPREAD**2)
         pose = after
         seen = np.array([transformed(inverse(pose), each) for each in world])
         seen = seen[np.hypot(*seen.T) < REACH]
@@ -78,14 +74,8 @@ def drive(seed: int) -> tuple[list[Keyframe], np.ndarray]:
         bearings = np.arctan2(seen[:, 1], seen[:, 0])
         bearings += SENSOR.bearing_sigma * random.standard_normal(n)
         ids, at = (UNNAMED + np.arange(n)).astype(np.uint32), k * SECOND
-        look = KeyframeScan(at, ids, ranges, bearings, unclaimed(n), at_ns=at, motion=motion)
-        none = np.empty(0)
-        keyframes.append(
-            Keyframe(
-                at, motion, np.empty(0, np.uint32), none, none, unclaimed(0),
-                looks=(look,), rest=Increment.identity(),
-            )
-        )  # fmt: skip
+        look = TimedScan(at, Scan(ids, ranges, bearings), at, motion)
+        keyframes.append(Keyframe(at, motion, looks=[look], rest=STILL))
     return keyframes, pose
 
 
@@ -93,7 +83,7 @@ def window_of(keyframes: list[Keyframe], seed: int) -> OpenWindow:
     front = FrontEnd(particles=100, association=AssociationSettings(least_seen=2))
     window = OpenWindow(RobotConfig(id="r1", seed=seed, sensor=SENSOR, front_end=front), 1, 0)
     for each in keyframes:
-        window.advance(each)
+        window.core.advance(each)
     window.confirm()
     return window
 

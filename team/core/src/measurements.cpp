@@ -1,4 +1,4 @@
-#include "reduction.hpp"
+#include "measurements.hpp"
 
 #include <algorithm>
 
@@ -51,7 +51,60 @@ Claim mean_claim(std::span<const Moved> measurements) {
 
 }  // namespace
 
-Reduced reduce(std::span<const Scan> scans, std::span<const se2::Pose<double>> poses) {
+bool Measurements::is_finite() const {
+  const auto finite = [](double x) { return std::isfinite(x); };
+  const auto finite_claim = [&](const Claim& each) { return finite(each.rr) && finite(each.rb) && finite(each.bb); };
+  return std::all_of(ranges.begin(), ranges.end(), finite) && std::all_of(bearings.begin(), bearings.end(), finite) &&
+         std::all_of(claims.begin(), claims.end(), finite_claim);
+}
+
+bool Measurements::is_unnamed() const {
+  return std::any_of(ids.begin(), ids.end(), [](std::uint32_t id) { return id >= UNNAMED; });
+}
+
+Measurements Measurements::only(const std::vector<bool>& taken) const {
+  Measurements chosen;
+  for (std::size_t k = 0; k < size(); k++) {
+    if (!taken[k]) continue;
+    chosen.ids.push_back(ids[k]);
+    chosen.ranges.push_back(ranges[k]);
+    chosen.bearings.push_back(bearings[k]);
+    if (!claims.empty()) chosen.claims.push_back(claims[k]);
+  }
+  return chosen;
+}
+
+Measurements Measurements::with(const Measurements& more) const {
+  const auto append = [](auto& to, const auto& from) { to.insert(to.end(), from.begin(), from.end()); };
+  Measurements both = *this;
+  append(both.ids, more.ids);
+  append(both.ranges, more.ranges);
+  append(both.bearings, more.bearings);
+  if (claims.empty() && more.claims.empty()) return both;
+  both.claims.resize(size(), models::OF_SENSOR);
+  append(both.claims, more.claims);
+  both.claims.resize(both.size(), models::OF_SENSOR);
+  return both;
+}
+
+Measurements of_points(std::vector<std::uint32_t> ids, std::span<const se2::Point<double>> points,
+                       std::span<const std::array<double, 3>> covariances) {
+  Measurements seen{std::move(ids), {}, {}, {}};
+  for (const auto& [x, y] : points) {
+    seen.ranges.push_back(elementary::hypot(x, y));
+    seen.bearings.push_back(elementary::atan2(y, x));
+  }
+  for (std::size_t k = 0; k < covariances.size(); k++) {
+    const auto [xx, xy, yy] = covariances[k];
+    const double reach = pack::max(seen.ranges[k], models::NEAREST_M);
+    const auto [s, c] = elementary::sin_cos(seen.bearings[k]);
+    const models::Turned<double> S = models::turned(xx, xy, yy, -s, c);
+    seen.claims.push_back({S.along, S.both / reach, S.across / (reach * reach), 1.0});
+  }
+  return seen;
+}
+
+Measurements reduce(std::span<const Scan> scans, std::span<const se2::Pose<double>> poses) {
   std::size_t count = 0;
   bool has_claims = false;
   for (const Scan& scan : scans) {
@@ -72,7 +125,7 @@ Reduced reduce(std::span<const Scan> scans, std::span<const se2::Pose<double>> p
       moved.push_back({scans[i].ids[k], seen.range, seen.bearing, claim});
     }
   std::stable_sort(moved.begin(), moved.end(), [](const Moved& a, const Moved& b) { return a.id < b.id; });
-  Reduced reduced;
+  Measurements reduced;
   std::vector<double> ranges, offsets;
   for (auto first = moved.begin(); first != moved.end();) {
     const auto last = std::find_if(first, moved.end(), [&](const Moved& each) { return each.id != first->id; });
