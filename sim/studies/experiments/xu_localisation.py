@@ -217,17 +217,14 @@ def stages_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     )
     blind = [state]
     for each in run.keyframes:
-        step = RobotStep(robot.id, each.keyframe.increment, robot.sensor)
+        step = RobotStep(robot.id, each.increment, robot.sensor)
         blind.append(localisation.filter_step(blind[-1], step, random))
     last = run.keyframes[-1]
     true = run.truth[last.stamp_ns]
     # The landmark farthest to the left: as in figure 3.3.
-    k = int(np.argmax(last.keyframe.bearings))
-    measurement = (
-        last.keyframe.ids[k : k + 1],
-        last.keyframe.ranges[k : k + 1],
-        last.keyframe.bearings[k : k + 1],
-    )
+    ids, ranges, bearings = last.scan.ids, last.scan.ranges, last.scan.bearings
+    k = int(np.argmax(bearings))
+    measurement = ids[k : k + 1], ranges[k : k + 1], bearings[k : k + 1]
     step = RobotStep(robot.id, Increment.identity(), robot.sensor, *measurement)
     weighed = localisation.filter_step(blind[-1], step, random)
     cloud, _ = fastslam.resampled(weighed.cloud, random)
@@ -270,10 +267,10 @@ def anywhere_run(world: Mapping[str, Any], clouds: bool) -> Figures:
     drawn = [_cloud(state.cloud, DRAWN)]
     poses = [run.start.tolist()]
     for k, each in enumerate(run.keyframes, 1):
-        keyframe = each.keyframe
-        far = np.argsort(keyframe.ranges)[-1:]  # all of them would localise at once
-        measurements = keyframe.ids[far], keyframe.ranges[far], keyframe.bearings[far]
-        step = RobotStep(config.id, keyframe.increment, config.sensor, *measurements)
+        ids, ranges, bearings = each.scan.ids, each.scan.ranges, each.scan.bearings
+        far = np.argsort(ranges)[-1:]  # all of them would localise at once
+        measurements = ids[far], ranges[far], bearings[far]
+        step = RobotStep(config.id, each.increment, config.sensor, *measurements)
         state = localisation.filter_step(state, step, random)
         if k in ANYWHERE_STEPS:
             true = run.truth[each.stamp_ns]

@@ -173,12 +173,12 @@ class MeasurementCentre(ComparisonCentre):
         turns = [
             RobotStep(
                 each.robot,
-                each.keyframe.increment,
+                each.increment,
                 self.models[each.robot].sensor,
-                each.keyframe.ids,
-                each.keyframe.ranges,
-                each.keyframe.bearings,
-                each.keyframe.own,
+                each.scan.ids,
+                each.scan.ranges,
+                each.scan.bearings,
+                each.scan.own,
             )
             for each in step
         ]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.odometry import segmenter_of
 from teamslam.team.rejection import BY_CORE, UNMEASURED
 from teamslam.team.robot.stream import Inbox
@@ -20,7 +21,8 @@ class RobotKeyframe(NamedTuple):
     stamp_ns: int
     robot: str
     number: int
-    keyframe: core.Keyframe
+    increment: Increment
+    scan: core.Scan
 
 
 @dataclass
@@ -80,7 +82,10 @@ class _Stream:
                 pass
 
     def _file(self, keyframes: Sequence[core.Keyframe], measurement: int) -> None:
-        self.waiting += [RobotKeyframe(e.stamp_ns, self.robot, measurement, e) for e in keyframes]
+        self.waiting += [
+            RobotKeyframe(e.stamp_ns, self.robot, measurement, Increment(*e.motion), e.scan)
+            for e in keyframes
+        ]
 
 
 class TeamKeyframes:

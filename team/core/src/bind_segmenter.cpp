@@ -105,8 +105,8 @@ void bind_scans(nb::module_& m) {
       .def_static("unnamed", &unnamed_scan, "ranges"_a, "bearings"_a, "covariances"_a = nb::bytes("", 0),
                   "Make a scan of landmarks without identities, numbered from 2^31 on.")
       .def_prop_ro("ids", [](const Measurements& self) {
-        return nb::cast(made<std::uint32_t, nb::ndim<1>>(std::vector<std::uint32_t>(self.ids), {self.size()}));
-      })
+        return made<std::uint32_t, nb::ndim<1>>(std::vector<std::uint32_t>(self.ids), {self.size()});
+      }, nb::rv_policy::move)
       .def_prop_ro("ranges", [](const Measurements& self) { return self.ranges; })
       .def_prop_ro("bearings", [](const Measurements& self) { return self.bearings; })
       .def_prop_ro("own", &made_claims, "Covariances (n, 4) that the measurements bring, (n, 0) where they bring none.")
