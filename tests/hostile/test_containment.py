@@ -11,11 +11,11 @@ from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.node import CentralNode
 from teamslam.sim.in_memory.team import final_map
 from teamslam.team.containment import Boundary
-from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.shell import RecordLoop
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot.main import RobotShell
+from teamslam.team.robot.mapper import Mapper
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.shell import FaultyRunError, Shell
 from teamslam.team.store import SubmapStore
@@ -35,16 +35,16 @@ BROKEN_NS = 17_000_000_000
 
 @pytest.fixture
 def brittle(monkeypatch):
-    whole = HybridSlam.drive
+    whole = Mapper._drive
 
-    def drive(self, interval, **how):
-        if interval.end_ns == BROKEN_NS:
-            self.sequence += 7
-            self._segmenter = None
+    def drive(self, measurement):
+        if measurement.stamp_ns == BROKEN_NS:
+            self._slam.sequence += 7
+            self._slam.segmenter = None
             raise ZeroDivisionError("no way")
-        return whole(self, interval, **how)
+        return whole(self, measurement)
 
-    monkeypatch.setattr(HybridSlam, "drive", drive)
+    monkeypatch.setattr(Mapper, "_drive", drive)
 
 
 def faults(samples: list[Sample]) -> list[m.Fault]:
