@@ -330,12 +330,12 @@ def _extend(
 
 def _find_fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
     """Find a landmark's likely fragments, itself included, which are no rivals."""
-    n = len(joint.mean)
-    at = evaluate_pairs(joint, np.full(n, landmark), np.arange(n), profile)
-    near = core.hypot(*(joint.mean - joint.mean[landmark]).T) < profile.same
-    least = required_llr(joint, np.full(n, landmark), np.arange(n), np.zeros(n), profile)
-    one = (at.llr >= least) & near & ~joint.apart[landmark]
-    return {landmark, *np.flatnonzero(one).tolist()}
+    away = core.hypot(*(joint.mean - joint.mean[landmark]).T)
+    near = np.flatnonzero((away < profile.same) & ~joint.apart[landmark])
+    own = np.full(len(near), landmark)
+    at = evaluate_pairs(joint, own, near, profile)
+    least = required_llr(joint, own, near, np.zeros(len(near)), profile)
+    return {landmark, *near[at.llr >= least].tolist()}
 
 
 def _accept_agreed(

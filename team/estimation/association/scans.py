@@ -60,7 +60,7 @@ def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
 def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
     """Return the rotation matrix of each angle."""
     s, c = core.sin_and_cos(angles)
-    return np.stack((np.stack((c, -s), -1), np.stack((s, c), -1)), -2)
+    return np.stack((c, -s, s, c), -1).reshape(-1, 2, 2)
 
 
 def relative_to(
