@@ -264,7 +264,7 @@ def _scans(
             )
         for _ in range(world.clutter):
             z, b = rng.uniform(0.5, world.reach_m), rng.uniform(-pi, pi)
-            labels.append("0")
+            labels.append("-1")
             rows.append(f"{stamp:.3f},{z!r},{b!r}")
     if world.hidden:
         _table(place / "detections.csv", "t_s,range_m,bearing_rad", rows)
