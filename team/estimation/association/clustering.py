@@ -3,7 +3,6 @@
 It uses no map and no other window, so that submaps stay independent. All particles share it.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +23,7 @@ from teamslam.team.estimation.association.tracking import Slip, slip_covariance,
 from teamslam.team.shapes import Bool, Float, Int64
 
 RARE = 0.05
-"""Significance level of the test for clutter."""
+"""Odds of a landmark below which its detections are clutter."""
 ROUNDS = 5
 """Most iterations of the share of clutter."""
 UNSEEN = 100.0
@@ -90,14 +89,10 @@ def associate_window(scans: Scans, settings: AssociationSettings) -> WindowAssoc
     found = cluster_window(scans, settings)
     scans, names, window = found.scans, found.names, found.window
     landmark_of = _drop_uncertain(scans, found.landmark_of, window, settings)
-    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(names))
     looks = _mark_looks(scans, window) | _mark_seen(scans, landmark_of, len(names))
-    confirmed = _mark_confirmed(scans, landmark_of, looks, names, settings)
-    all_looks = looks.sum(axis=1)
-    rare = [
-        _is_rare(*each, settings) for each in zip(counts.tolist(), all_looks.tolist(), strict=True)
-    ]
-    clutter = np.append(np.array(rare, np.bool_) & ~confirmed, False)[landmark_of]
+    odds = _weigh_landmarks(scans, landmark_of, looks, names, settings)
+    confirmed, false = odds > 0.0, odds < core.log(RARE)
+    clutter = np.append(false, False)[landmark_of]
     remaining = np.where(np.append(confirmed, False)[landmark_of], landmark_of, UNASSIGNED)
     landmark_of, names, _ = _renumber(remaining, names, window.landmarks)
     seen = _mark_seen(scans, landmark_of, len(names))
@@ -233,14 +228,15 @@ def _mark_looks(scans: Scans, window: SmoothedWindow) -> Bool[np.ndarray, "L K"]
     return looks
 
 
-def _mark_confirmed(
+def _weigh_landmarks(
     scans: Scans,
     landmark_of: Int64[np.ndarray, " N"],
     looks: Bool[np.ndarray, "L K"],
     names: Int64[np.ndarray, " L"],
     settings: AssociationSettings,
-) -> Bool[np.ndarray, " L"]:
-    """Mark the landmarks with an identity, and those that are likelier real than clutter.
+) -> Float[np.ndarray, " L"]:
+    """Compute the log odds that each landmark is real; ∞ with an identity, at most 0 with too few
+    detections.
 
     After its first detection, a real landmark is detected at each look with its own probability, of
     a beta distribution Beta(a, b) whose mean p is that of the window's confirmed landmarks; a place
@@ -277,8 +273,9 @@ def _mark_confirmed(
         last, confirmed = confirmed, may & (score > 0.0)
         if np.array_equal(last, confirmed):
             break
-    marked: Bool[np.ndarray, " L"] = confirmed | named
-    return marked
+    odds: Float[np.ndarray, " L"] = np.where(may, score, np.minimum(score, 0.0))
+    odds[named] = np.inf
+    return odds
 
 
 def _log_beta(
@@ -293,12 +290,3 @@ def _log_beta(
     a, b = ALIKE * p, ALIKE * (1.0 - p)
     found = log_rising(a, seen) + log_rising(b, missed) - log_rising(ALIKE, seen + missed)
     return np.asarray(found)
-
-
-def _is_rare(seen: int, looks: int, settings: AssociationSettings) -> bool:
-    p = settings.detection_probability
-    term, total = math.prod([1.0 - p] * looks), 0.0
-    for c in range(seen + 1):
-        total += term
-        term *= (looks - c) / (c + 1.0) * p / (1.0 - p)
-    return total < RARE
