@@ -22,6 +22,7 @@ from teamslam.team.estimation.map_joining.alignment import NEEDED, SharedPoints
 from teamslam.team.estimation.map_joining.distinctness import (
     OdometryTie,
     Repetition,
+    find_disagreeing,
     find_lost_streams,
     find_missed,
     find_odometry_ties,
@@ -95,7 +96,10 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     if tail != "final":
         return Shown(marginals.confirmed(fold, config.landmark_submaps))
     most = len(fold.main.graph.submaps) + fold.condensed_count
-    ids = marginals.confirmed(fold, config.landmark_submaps, min(CONFIRMED_BY, most))
+    least = min(CONFIRMED_BY, most)
+    ids = marginals.confirmed(fold, config.landmark_submaps, least)
+    if not fold.condensed_count:
+        ids = sorted({*ids}.difference(find_disagreeing(fold, ids, least)))
     unnamed = [id_ for id_ in ids if id_ >= UNNAMED]
     if not unnamed:
         return Shown(ids)

@@ -54,6 +54,41 @@ def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
     return [id_ for id_ in sorted(ids) if best.get(node_of.get(id_, -1), 0.0) > limit]
 
 
+WELL_OBSERVED = 4
+"""Least submaps of a landmark whose residuals show how far right associations are off."""
+LEAST_RESIDUALS = 30
+"""Least number of these residuals from which their scale is learnt."""
+
+
+def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
+    """Find the unnamed landmarks of which fewer than `least` submaps agree with the rest,
+    ascending; none of a saved map or that an operator has judged.
+
+    A submap agrees if its χ² is within `landmark_gate`, times the scale of the map's residuals
+    where that is below 1: their median over that of χ² with two degrees of freedom, 2 ln 2. A
+    stated covariance that is too large otherwise lets a neighbour pass for the landmark.
+    """
+    island = fold.main
+    graph, settings = island.graph, island.settings
+    chi2 = graph.factors.landmark_chi2(island.state, settings.covariance_factor)
+    nodes = np.concatenate([each.landmarks for each in graph.submaps])
+    is_saved = np.concatenate(
+        [np.full(len(s.landmarks), is_map(s.contribution.stream)) for s in graph.submaps]
+    )
+    counts = np.bincount(nodes[nodes >= 0], minlength=len(graph.fixed))
+    unnamed = np.isin(nodes, [node for id_, node in graph.landmarks.items() if id_ >= UNNAMED])
+    sound = chi2[unnamed & ~is_saved & (counts[nodes] >= WELL_OBSERVED)]
+    if len(sound) < LEAST_RESIDUALS:
+        return []
+    scale = min(float(np.median(sound)) / (2.0 * core.log(2.0)), 1.0)
+    agrees = (chi2 <= scale * settings.landmark_gate) & (nodes >= 0)
+    enough = np.bincount(nodes[agrees], minlength=len(counts)) >= least
+    enough[nodes[is_saved & (nodes >= 0)]] = True
+    judged = fold.landmarks.judged()
+    unnamed_ids = (id_ for id_ in sorted({*ids} - judged) if id_ >= UNNAMED)
+    return [id_ for id_ in unnamed_ids if not enough[graph.landmarks[id_]]]
+
+
 def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
     """Find the landmarks of the main island that nearly all submaps miss which look at their place,
     ascending; none that an operator has judged. A saved map looks at no place.
