@@ -1,10 +1,16 @@
-"""Builders of messages, with an ordinary value for each field not given."""
+"""Builders of messages, with an ordinary value for each field not given.
+
+The numbers of an array are encoded as its field's are.
+"""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, TypeVar
 
+import msgspec
+
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 
 S = 1_000_000_000
 """One second [ns]."""
@@ -22,6 +28,16 @@ ORDINARY: dict[str, Any] = {
     "teammates": (), "ids": b"", "ranges": b"", "bearings": b"", "stamps": b"", "poses": b"",
     "covariances": b"", "signature": b"", "sequences": (), "streams": (),
 }  # fmt: skip
+ENCODED: dict[str, Callable[[Any], bytes]] = {
+    **dict.fromkeys(("ids", "counts", "rows", "landmarks", "labels"), from_ids),
+    **dict.fromkeys(("stamps", "nodes"), from_stamps),
+}
+"""All other arrays are of floats."""
+
+
+@cache
+def _arrays_of(kind: type[msgspec.Struct]) -> frozenset[str]:
+    return frozenset(field.name for field in msgspec.structs.fields(kind) if field.type is bytes)
 
 
 def _built(kind: Callable[..., M], **fields: object) -> M:
@@ -30,6 +46,9 @@ def _built(kind: Callable[..., M], **fields: object) -> M:
     values = {name: ORDINARY[name] for name in required if name in ORDINARY} | fields
     if "node" in required and "node" not in values:
         values["node"] = f"robot/{values.get('robot', 'r1')}"
+    for name in _arrays_of(kind) & fields.keys():
+        if not isinstance(fields[name], bytes):
+            values[name] = ENCODED.get(name, from_floats)(fields[name])
     return kind(**values)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -38,9 +38,7 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
     )
     for name in names:
         yield sample(Outgoing(ch.ALIVE, f"robot/{name}", build.liveliness(node=f"robot/{name}")))
-        yield sample(
-            Outgoing(ch.START, name, build.initial_pose(robot=name, pose=from_floats([0, 0, 0])))
-        )
+        yield sample(Outgoing(ch.START, name, build.initial_pose(robot=name, pose=[0, 0, 0])))
     phase = rng.uniform(0.0, 2.0 * np.pi, robots)
     reach = rng.uniform(0.1, 0.45, robots) * size_m
     P = from_floats(np.diag([0.04, 0.09, 1e-3]))
@@ -54,15 +52,9 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
                 np.arctan2(1.3 * np.cos(1.3 * angle), -np.sin(angle)),
             ]
             said = np.array(true) + rng.normal(size=3) * [0.2, 0.3, 0.03]
-            truth = build.truth(
-                stamp_ns=at, robot=name, stamps=from_stamps([at]), poses=from_floats(true)
-            )
+            truth = build.truth(stamp_ns=at, robot=name, stamps=[at], poses=true)
             pose = build.pose_estimate(
-                stamp_ns=at,
-                robot=name,
-                map_digest=b"12345678",
-                pose=from_floats(said),
-                covariance=P,
+                stamp_ns=at, robot=name, map_digest=b"12345678", pose=said, covariance=P
             )
             yield sample(Outgoing(ch.TRUTH, name, truth))
             yield sample(Outgoing(ch.TEAM_POSE, name, pose))
@@ -85,7 +77,7 @@ def _map(
         final=final,
         provisional=not final,
         members=members,
-        ids=from_ids(range(count)),
-        means=from_floats(means),
-        covariance=from_floats(blocks),
+        ids=range(count),
+        means=means,
+        covariance=blocks,
     )

@@ -154,8 +154,8 @@ def submap(i: int, robot: str = "alpha", landmarks: int = 2) -> m.Submap:
         last_measurement=10 * i + 9,
         start_ns=i * 1_000_000,
         config=b"configur",
-        ids=from_ids(range(landmarks)),
-        mean=from_floats(np.arange(n) / 8.0),
+        ids=range(landmarks),
+        mean=np.arange(n) / 8.0,
         covariance=packed(spd(n)),
     )
 
@@ -203,7 +203,7 @@ def examples() -> Iterator[m.Message]:
     means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
     digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
     member = m.VersionEntry(robot="alpha", incarnation=1, sequence=5)
-    yield build.initial_pose(robot="alpha", pose=three, covariance=from_floats(spd(3)))
+    yield build.initial_pose(robot="alpha", pose=three, covariance=spd(3))
     yield build.odometry(
         stamp_ns=1_000,
         robot="alpha",
@@ -218,7 +218,7 @@ def examples() -> Iterator[m.Message]:
         number=2,
         duration_ns=100_000_000,
         increment=three,
-        covariance=from_floats(spd(3)),
+        covariance=spd(3),
     )
     yield m.Steering(
         stamp_ns=1_000,
@@ -234,8 +234,8 @@ def examples() -> Iterator[m.Message]:
         robot="alpha",
         number=3,
         ids=two,
-        ranges=from_floats([2.0, 3.5]),
-        bearings=from_floats([0.5, -1]),
+        ranges=[2.0, 3.5],
+        bearings=[0.5, -1],
         covariances=blocks,
     )
     yield build.points(
@@ -245,23 +245,16 @@ def examples() -> Iterator[m.Message]:
         stamp_ns=2_500,
         robot="alpha",
         number=3,
-        ranges=from_floats([2.0, 3.5]),
-        bearings=from_floats([0.5, -1]),
+        ranges=[2.0, 3.5],
+        bearings=[0.5, -1],
         covariances=blocks,
-        signatures=from_floats([0.25, 0.5]),
-        classes=from_floats([-0.25, -1.5, -2.0, -0.125]),
+        signatures=[0.25, 0.5],
+        classes=[-0.25, -1.5, -2.0, -0.125],
     )
     yield build.sightings(
-        stamp_ns=3_000,
-        robot="alpha",
-        number=4,
-        teammates=("bravo",),
-        ranges=from_floats([6.0]),
-        bearings=from_floats([-3.0]),
+        stamp_ns=3_000, robot="alpha", number=4, teammates=("bravo",), ranges=[6.0], bearings=[-3.0]
     )
-    yield build.truth(
-        stamp_ns=4_000, robot="alpha", stamps=from_stamps([0, 4_000]), poses=from_floats(range(6))
-    )
+    yield build.truth(stamp_ns=4_000, robot="alpha", stamps=[0, 4_000], poses=range(6))
     yield m.TruthLandmarks(stamp_ns=-5, ids=two, positions=means)
     yield m.TruthLabels(
         stamp_ns=-5,
@@ -286,18 +279,18 @@ def examples() -> Iterator[m.Message]:
         last_measurement=19,
         start_ns=8_000,
         config=digest,
-        ids=from_ids([4, UNNAMED + 1]),
-        mean=from_floats(range(10)),
+        ids=[4, UNNAMED + 1],
+        mean=range(10),
         covariance=packed(spd(10)),
-        nodes=from_stamps([8_500]),
+        nodes=[8_500],
         sightings=1,
         biases=("bearing", "range_scale"),
-        sensitivity=from_floats(np.arange(20) / 16.0),
+        sensitivity=np.arange(20) / 16.0,
         gated=3,
-        counts=from_ids([6]),
+        counts=[6],
         seen=b"\x05\x01",
         keyframes=9,
-        classes=from_floats([-0.25, -1.5, -2.0, -0.125]),
+        classes=[-0.25, -1.5, -2.0, -0.125],
     )
     yield m.Association(
         stamp_ns=9_000,
@@ -350,7 +343,7 @@ def examples() -> Iterator[m.Message]:
         sequence=5,
         map_digest=digest,
         pose=three,
-        covariance=from_floats(spd(3)),
+        covariance=spd(3),
         frame="bravo/1",
         in_team_frame=False,
     )
@@ -464,7 +457,7 @@ def examples() -> Iterator[m.Message]:
         sequence=5,
         digest=digest,
         ids=two,
-        mean=from_floats(range(7)),
+        mean=range(7),
         covariance=packed(spd(7)),
         covariance_factor=2.5,
         biases=(
@@ -482,12 +475,12 @@ def examples() -> Iterator[m.Message]:
         stamp_ns=9_000,
         robot="alpha",
         digest=digest,
-        stamps=from_stamps([9_000]),
+        stamps=[9_000],
         poses=three,
-        covariances=from_floats(spd(3)),
-        start=from_floats([0.5, 0.25, 0.125]),
-        start_covariance=from_floats(spd(3)),
-        crosses=from_floats(range(9)),
+        covariances=spd(3),
+        start=[0.5, 0.25, 0.125],
+        start_covariance=spd(3),
+        crosses=range(9),
     )
     yield build.progress(stamp_ns=9_000, node="central", robot="alpha", measurements=128, submaps=6)
     yield m.Rendezvous(

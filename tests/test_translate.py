@@ -12,7 +12,7 @@ from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.robot.statements import MessageWriter
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.digest import announce_configuration, digest_of
 from tests import build
@@ -105,18 +105,14 @@ def test_a_prior_survives_the_wire_bit_for_bit(ids, seed):
 @pytest.mark.parametrize("covariance", [None, np.diag([0.25, 0.5, 0.125])])
 def test_a_start_is_known_exactly_or_with_a_covariance(covariance):
     spread = b"" if covariance is None else from_floats(covariance)
-    start = translate.start_of(
-        build.initial_pose(pose=from_floats([1.0, 2.0, 3.0]), covariance=spread)
-    )
+    start = translate.start_of(build.initial_pose(pose=[1.0, 2.0, 3.0], covariance=spread))
     np.testing.assert_array_equal(start.pose, [1.0, 2.0, 3.0])
     np.testing.assert_equal(start.covariance, covariance)
     assert start.stream == ("r1", 1)
 
 
 def estimate(covariance, *, joint):
-    return build.map_estimate(
-        joint=joint, ids=from_ids([3, 9]), means=from_floats(np.arange(4.0)), covariance=covariance
-    )
+    return build.map_estimate(joint=joint, ids=[3, 9], means=np.arange(4.0), covariance=covariance)
 
 
 def test_a_map_carries_its_joint_covariance_or_the_blocks_of_it():

@@ -140,13 +140,13 @@ class Team:
             last_measurement=k * 20 + 20,
             start_ns=k * 10 * S,
             config=CONFIG,
-            ids=from_ids(ids),
-            mean=from_floats(mean),
+            ids=ids,
+            mean=mean,
             covariance=packed(covariance(rng, n)),
-            nodes=from_stamps(nodes),
+            nodes=nodes,
             sightings=0,
             biases=biases,
-            sensitivity=from_floats(numbers(rng, n * len(biases))),
+            sensitivity=numbers(rng, n * len(biases)),
             gated=0,
         )
 
@@ -299,8 +299,8 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
                 robot=robot,
                 number=counter + 1,
                 teammates=names,
-                ranges=from_floats(np.abs(numbers(rng, len(names)))),
-                bearings=from_floats(rng.uniform(-np.pi, np.pi, len(names))),
+                ranges=np.abs(numbers(rng, len(names))),
+                bearings=rng.uniform(-np.pi, np.pi, len(names)),
             )
         if valid(message) is not None:  # impossible messages of a driver have no number
             counter += 1
@@ -324,8 +324,8 @@ def prior(rng: np.random.Generator, robot: str) -> m.Prior:
         robot=robot,
         sequence=sequence,
         digest=CONFIG,
-        ids=from_ids(ids),
-        mean=from_floats(numbers(rng, n)),
+        ids=ids,
+        mean=numbers(rng, n),
         covariance=packed(covariance(rng, n)),
     )
 

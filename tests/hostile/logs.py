@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.recording.test_log import bomb
@@ -87,7 +87,7 @@ def far_counters(path: Path) -> Path:
         last_measurement=far,
         start_ns=1,
         config=DIGEST,
-        ids=from_ids([1]),
+        ids=[1],
         mean=joint,
         covariance=packed(spd(5)),
     )

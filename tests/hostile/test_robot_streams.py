@@ -19,7 +19,7 @@ from teamslam.team.config import (
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, from_floats, from_ids, ids
+from teamslam.team.wire.arrays import floats, ids
 from tests import build
 from tests.hostile.drawing import S, hostile_stream, robot_session
 
@@ -51,17 +51,13 @@ def drive(
     steps: int, odd: dict[int, m.Message] | None = None, *, sees: bool = True
 ) -> list[m.Message]:
     """A circle at 1 m/s, three landmarks each second; `odd`: in place of one second's messages."""
-    out: list[m.Message] = [build.initial_pose(pose=from_floats([0.0, 0.0, 0.0]))]
+    out: list[m.Message] = [build.initial_pose(pose=[0.0, 0.0, 0.0])]
     for k in range(1, steps + 1):
         own = build.odometry(stamp_ns=k * S, number=2 * k)
         scan = [(i, float(np.hypot(*p)), 0.3 * i - 1.0) for i, p in LANDMARKS.items()]
         seen, ranges, bearings = zip(*scan, strict=True) if sees else ((), (), ())
         look = build.observations(
-            stamp_ns=k * S,
-            number=2 * k - 1,
-            ids=from_ids(seen),
-            ranges=from_floats(ranges),
-            bearings=from_floats(bearings),
+            stamp_ns=k * S, number=2 * k - 1, ids=seen, ranges=ranges, bearings=bearings
         )
         out += [look, (odd or {}).get(k) or own]
     return [
@@ -113,13 +109,7 @@ def test_a_clock_that_has_truly_leapt_is_followed_from_the_second_interval_on():
 
 
 def test_a_range_beyond_the_bounds_is_not_taken():
-    far = build.observations(
-        stamp_ns=5 * S,
-        number=9,
-        ids=from_ids([1]),
-        ranges=from_floats([9e5]),
-        bearings=from_floats([0.0]),
-    )
+    far = build.observations(stamp_ns=5 * S, number=9, ids=[1], ranges=[9e5], bearings=[0.0])
     messages = [far if getattr(x, "number", None) == 9 else x for x in drive(20)]
     _, _, ledger = lived(messages, bounds=Bounds(extent_m=1e4))
     assert ledger[Rejection.RANGE.disposition] == 1
@@ -136,9 +126,9 @@ def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bo
             each = build.observations(
                 stamp_ns=each.stamp_ns,
                 number=k,
-                ids=from_ids(seen),
-                ranges=from_floats(ranges),
-                bearings=from_floats(np.linspace(-3.0, 3.0, n)),
+                ids=seen,
+                ranges=ranges,
+                bearings=np.linspace(-3.0, 3.0, n),
             )
         messages.append(each)
     bounds = Bounds(submap_landmarks=200)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from teamslam.central.config import CentralConfig
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, from_floats, from_ids, from_stamps
+from teamslam.team.wire.arrays import floats, from_floats
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.hostile.drawing import (
@@ -44,10 +44,10 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
         last_measurement=sequence * 20 + 20,
         start_ns=begins,
         config=CONFIG,
-        ids=from_ids(np.array(ids, np.uint32)),
-        mean=from_floats(mean),
+        ids=np.array(ids, np.uint32),
+        mean=mean,
         covariance=packed(np.eye(n) * 0.01 if P is None else P),
-        nodes=from_stamps(np.array(nodes, np.int64)),
+        nodes=np.array(nodes, np.int64),
         **fields,
     )
 

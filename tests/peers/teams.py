@@ -10,7 +10,6 @@ from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
@@ -24,9 +23,7 @@ def member(channel: ch.Channel, message: m.Message) -> Member:
 
 
 def start(robot: str, incarnation: int = 1) -> Member:
-    pose = build.initial_pose(
-        robot=robot, incarnation=incarnation, pose=from_floats([0.0, 0.0, 0.0])
-    )
+    pose = build.initial_pose(robot=robot, incarnation=incarnation, pose=[0.0, 0.0, 0.0])
     return member(ch.START, pose)
 
 

@@ -367,12 +367,7 @@ def test_numbers_read_back_from_csv_are_the_same(tmp_path_factory, seen):
     folder = tmp_path_factory.mktemp("csv")
     ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
     message = build.observations(
-        stamp_ns=5,
-        robot="alpha",
-        number=9,
-        ids=from_ids(ids),
-        ranges=from_floats(ranges),
-        bearings=from_floats(bearings),
+        stamp_ns=5, robot="alpha", number=9, ids=ids, ranges=ranges, bearings=bearings
     )
     log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
     export_tables(log, folder / "out")

@@ -58,8 +58,8 @@ def fused(ids=(1, 2), at=0.0, *, final=False, exchange=0):
         final=final,
         exchange=exchange,
         joint=True,
-        ids=from_ids(ids),
-        means=from_floats(np.full(2 * len(ids), at)),
+        ids=ids,
+        means=np.full(2 * len(ids), at),
         covariance=packed(spd(2 * len(ids))),
     )
 

@@ -25,8 +25,8 @@ def prior(sequence: int) -> m.Prior:
         incarnation=0,
         sequence=sequence,
         digest=b"",
-        ids=from_ids((1, 2)),
-        mean=from_floats([0.0] * 7),
+        ids=(1, 2),
+        mean=[0.0] * 7,
         covariance=packed(spd(7)),
     )
 

@@ -14,7 +14,7 @@ from teamslam.team import translate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration
@@ -72,8 +72,8 @@ def final_map(
         stamp_ns=STEPS * 10**9,
         final=True,
         joint=joint,
-        ids=from_ids(ids),
-        means=from_floats(means),
+        ids=ids,
+        means=means,
         covariance=content,
         chi2=30.0,
         dof=20,
@@ -94,7 +94,7 @@ def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoin
         Outgoing(
             channel,
             "r1",
-            build.pose_estimate(stamp_ns=t, pose=from_floats(p), covariance=unit),
+            build.pose_estimate(stamp_ns=t, pose=p, covariance=unit),
         )
         for t, p in zip(ends, poses, strict=True)
     ]

@@ -64,8 +64,8 @@ def submap(sequence: int, first: int, last: int) -> Outgoing:
         first_measurement=first,
         last_measurement=last,
         start_ns=0,
-        ids=from_ids([]),
-        mean=from_floats(np.zeros(3)),
+        ids=[],
+        mean=np.zeros(3),
         covariance=joint_bytes(np.eye(3)),
     )
     return Outgoing(ch.SUBMAP, "r1", message)

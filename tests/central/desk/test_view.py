@@ -24,7 +24,7 @@ from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire import views
-from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import decoded
 from tests import build
 from tests.scenarios import with_world
@@ -134,9 +134,7 @@ def test_views_of_the_same_log_are_the_same_bytes(samples):
 
 def pose(at_s: float, x: float, robot: str = "r1", sigma: float = 0.5) -> m.PoseEstimate:
     P = from_floats(sigma**2 * np.eye(3))
-    return build.pose_estimate(
-        stamp_ns=round(at_s * S), robot=robot, pose=from_floats([x, 0, 0]), covariance=P
-    )
+    return build.pose_estimate(stamp_ns=round(at_s * S), robot=robot, pose=[x, 0, 0], covariance=P)
 
 
 def truth(times: list[float], robot: str = "r1") -> m.Truth:
@@ -144,7 +142,7 @@ def truth(times: list[float], robot: str = "r1") -> m.Truth:
     return build.truth(
         stamp_ns=round(times[-1] * S),
         robot=robot,
-        stamps=from_stamps([round(t * S) for t in times]),
+        stamps=[round(t * S) for t in times],
         poses=poses,
     )
 
@@ -168,10 +166,7 @@ def test_the_nees_of_a_joint_map_is_that_of_the_report():
     P = np.diag([0.25, 1.0, 0.25, 1.0]) + 0.2
     means = np.array([[1.0, 0.0], [5.5, 5.0]])
     fused = fused_map(
-        ids=from_ids([4, 7]),
-        means=from_floats(means.ravel()),
-        covariance=translate.joint_bytes(P),
-        joint=True,
+        ids=[4, 7], means=means.ravel(), covariance=translate.joint_bytes(P), joint=True
     )
     true = np.array([[0.0, 0.0], [5.0, 5.0]])
     fit = TrueLandmarks(np.array([4, 7], np.uint32), true).fit(fused)

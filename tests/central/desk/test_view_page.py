@@ -122,7 +122,7 @@ def test_the_page_is_told_when_a_robots_poses_are_in_another_frame():
                 stamp_ns=second * 10**9,
                 robot=robot,
                 pose=bytes(24),
-                covariance=from_floats(np.eye(3)),
+                covariance=np.eye(3),
                 frame=f"{robot}/1" if own else "r1/1",
                 in_team_frame=not own,
             )
@@ -145,13 +145,13 @@ def test_the_page_gets_measurements_in_the_robots_frame():
 
     def scan(stamp_ns: int, names: list[int]) -> tuple[ch.Channel, m.Message]:
         return ch.OBSERVATIONS, build.observations(
-            stamp_ns=stamp_ns, ids=from_ids(names), ranges=from_floats(np.full(len(names), 2.0)),
-            bearings=from_floats(np.zeros(len(names))),
+            stamp_ns=stamp_ns, ids=names, ranges=np.full(len(names), 2.0),
+            bearings=np.zeros(len(names))
         )  # fmt: skip
 
     mate = build.sightings(
-        stamp_ns=10**9, teammates=("r2",), ranges=from_floats([1.0]),
-        bearings=from_floats([np.pi / 2]),
+        stamp_ns=10**9, teammates=("r2",), ranges=[1.0],
+        bearings=[np.pi / 2]
     )  # fmt: skip
     told = told_of(
         (ch.ROBOT_CONFIG, config), scan(0, [7]), scan(2 * 10**8, [7, 8]), scan(6 * 10**8, [7]),
@@ -244,8 +244,8 @@ def test_the_page_gets_the_changes_since_the_saved_map_with_the_old_places():
         m.LandmarkChange(landmark=8, state="new"),
     )
     fused = fused_map(
-        final=True, changes=changes, ids=from_ids([3, 4, 7, 8]),
-        means=from_floats(np.arange(8.0)), covariance=from_floats([1.0, 0.0, 1.0] * 4),
+        final=True, changes=changes, ids=[3, 4, 7, 8],
+        means=np.arange(8.0), covariance=[1.0, 0.0, 1.0] * 4
     )  # fmt: skip
     plain = msgspec.structs.replace(fused, changes=())
     shown, without = (
@@ -273,9 +273,9 @@ def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Chan
     path = np.hstack((transform_points(MAP_FROM_TRUTH, TRUE + 1.0), heading + MAP_FROM_TRUTH[2]))
     at = from_stamps(np.arange(3) * 10**9)
     fused = fused_map(
-        stamp_ns=2 * 10**9, final=True, frame="r1/1", ids=from_ids([1, 2, 3]),
-        means=from_floats(transform_points(MAP_FROM_TRUTH, TRUE)),
-        covariance=from_floats([1.0, 0.0, 1.0] * 3),
+        stamp_ns=2 * 10**9, final=True, frame="r1/1", ids=[1, 2, 3],
+        means=transform_points(MAP_FROM_TRUTH, TRUE),
+        covariance=[1.0, 0.0, 1.0] * 3
     )  # fmt: skip
     start = build.initial_pose(
         robot="r1", incarnation=1, pose=from_floats(np.zeros(3)) if known else b""
@@ -284,8 +284,8 @@ def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Chan
     return [
         (ch.START, start),
         *([(ch.TRUTH_LANDMARKS, truth)] if landmarks else []),
-        (ch.TRUTH, build.truth(robot="r1", stamps=at, poses=from_floats(true_path))),
-        (ch.TRAJECTORY, build.trajectory(robot="r1", stamps=at, poses=from_floats(path))),
+        (ch.TRUTH, build.truth(robot="r1", stamps=at, poses=true_path)),
+        (ch.TRAJECTORY, build.trajectory(robot="r1", stamps=at, poses=path)),
         (ch.FINAL_MAP, fused),
     ]
 
@@ -317,7 +317,7 @@ def test_foxgloves_true_landmarks_are_in_the_frame_of_the_map(known, moved):
     node = ViewerNode()
     pose = build.pose_estimate(
         stamp_ns=2 * 10**9, robot="r1", frame="r1/1", in_team_frame=True,
-        pose=from_floats(np.zeros(3)), covariance=from_floats(np.eye(3)),
+        pose=np.zeros(3), covariance=np.eye(3)
     )  # fmt: skip
     views = []
     for channel, message in [
@@ -338,7 +338,7 @@ def test_smoothed_poses_at_ends_of_submaps_are_dots_and_those_at_keyframes_a_lin
         trajectory = msgspec.structs.replace(trajectory, crosses=from_floats(np.zeros((3, 9))))
     pose = build.pose_estimate(
         stamp_ns=2 * 10**9, robot="r1", frame="r1/1", in_team_frame=True,
-        pose=from_floats(np.zeros(3)), covariance=from_floats(np.eye(3)),
+        pose=np.zeros(3), covariance=np.eye(3)
     )  # fmt: skip
     log = [*before, (ch.TEAM_POSE, pose), (channel, trajectory), last]
     (path,) = (each for each in told_of(*log) if each["k"] == "path")

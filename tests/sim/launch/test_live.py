@@ -8,7 +8,6 @@ from rich.console import Console
 from teamslam.sim.launch import live
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
 from tests import build
 from tests.support import fused_map
 
@@ -82,11 +81,7 @@ def told(robots: int) -> Watch:
             pose_sigma_m=12.34, nis_per_dof=1.05, messages_per_s=1500.0, bytes_per_s=150_000.0,
         )  # fmt: skip
     watch.fused = fused_map(
-        ids=from_ids([1, 2]),
-        means=from_floats([0.0] * 4),
-        covariance=from_floats([1.0, 0.0, 1.0] * 2),
-        chi2=1.0,
-        dof=1,
+        ids=[1, 2], means=[0.0] * 4, covariance=[1.0, 0.0, 1.0] * 2, chi2=1.0, dof=1
     )
     return watch
 

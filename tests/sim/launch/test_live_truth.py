@@ -5,7 +5,6 @@ from scipy.stats import chi2
 from teamslam.sim.launch.live_errors import LiveErrors
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_stamps
 from tests import build
 
 SECOND = 1_000_000_000
@@ -13,14 +12,12 @@ COVARIANCE = np.array([[0.09, 0.01, 0.0], [0.01, 0.04, 0.005], [0.0, 0.005, 0.01
 
 
 def pose(at_s: float, xyt: np.ndarray) -> m.PoseEstimate:
-    return build.pose_estimate(
-        stamp_ns=round(at_s * SECOND), pose=from_floats(xyt), covariance=from_floats(COVARIANCE)
-    )
+    return build.pose_estimate(stamp_ns=round(at_s * SECOND), pose=xyt, covariance=COVARIANCE)
 
 
 def truth(seconds: list[float], poses: np.ndarray) -> m.Truth:
     stamps = [round(s * SECOND) for s in seconds]
-    return build.truth(stamp_ns=stamps[-1], stamps=from_stamps(stamps), poses=from_floats(poses))
+    return build.truth(stamp_ns=stamps[-1], stamps=stamps, poses=poses)
 
 
 def line(seconds: list[float]) -> np.ndarray:

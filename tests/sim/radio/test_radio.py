@@ -5,7 +5,6 @@ from teamslam.sim.radio.bus import behind_radio, plan_of, reach_in, reach_of
 from teamslam.sim.world.config import Radio, RadioWindow
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -74,6 +73,4 @@ def _stamped(said: m.Submap, stamp_ns: int) -> m.Submap:
 
 
 def _pose(stamp_ns: int) -> m.PoseEstimate:
-    return build.pose_estimate(
-        stamp_ns=stamp_ns, pose=from_floats(np.zeros(3)), covariance=from_floats(np.eye(3))
-    )
+    return build.pose_estimate(stamp_ns=stamp_ns, pose=np.zeros(3), covariance=np.eye(3))

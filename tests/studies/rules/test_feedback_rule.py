@@ -8,7 +8,7 @@ from teamslam.sim.studies.rules.map_rules import RULES, RoundsCentre
 from teamslam.team import translate
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.support import packed, spd
@@ -33,7 +33,7 @@ def estimate(robot, number, at=0.0):
         robot=robot,
         sequence=number,
         exchange=number,
-        ids=from_ids([1, 2]),
+        ids=[1, 2],
         means=means,
         covariance=packed(spd(4)),
     )

@@ -9,7 +9,7 @@ from teamslam.sim.studies.rules.map_fusion import kalman
 from teamslam.team import translate
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import packed, spd
@@ -32,7 +32,7 @@ def estimate(robot, sequence, ids=(1, 2), at=0.0, *, joint=True):
         robot=robot,
         sequence=sequence,
         joint=joint,
-        ids=from_ids(ids),
+        ids=ids,
         means=means,
         covariance=content,
     )
