@@ -16,10 +16,10 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary
 from teamslam.team.peers.members import Member
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, read_reply
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration
+from tests import build
 from tests.air import Air
 
 AFTER_S = 3600.0
@@ -123,7 +123,7 @@ class PeerTeam:
 
     def _enter(self, robot: str, seat: _Seat) -> None:
         self._say(robot, seat.node.begin())
-        token = m.Liveliness(stamp_ns=0, node=seat.node.name, alive=True)
+        token = build.liveliness(node=seat.node.name)
         self._to_world(Outgoing(ch.ALIVE, seat.node.name, token))
 
     def restart(self, config: RobotConfig, restored: Iterable[Member] = ()) -> None:
@@ -137,8 +137,8 @@ class PeerTeam:
         incarnation = max(1, seat.node.node.incarnation)
         while True:
             first = seat.node.node.next_measurement
-            request = m.MeasurementsRequest(
-                stamp_ns=0, robot=config.id, incarnation=incarnation, first=first, last=-1
+            request = build.measurements_request(
+                robot=config.id, incarnation=incarnation, first=first
             )
             for reply in world.measurements(encoded(request)):
                 sample = read_reply(ch.MEASUREMENTS, config.id, reply, 0)
@@ -221,7 +221,7 @@ class PeerTeam:
                 if there != (other in seat.reached):
                     (seat.reached.add if there else seat.reached.discard)(other)
                     node = self.seats[other].node.name
-                    token = m.Liveliness(stamp_ns=0, node=node, alive=there)
+                    token = build.liveliness(node=node, alive=there)
                     sample = Sample(ch.ALIVE.key(node), encoded(token), 0, 0, 0)
                     self._say(robot, seat.boundary.take(seat.node, sample))
 

@@ -21,7 +21,7 @@ def begun(robot, incarnation=1):
     return build.initial_pose(robot=robot, incarnation=incarnation)
 
 
-ORDER = m.TeamEnd(stamp_ns=0, by="operator", reason="it rains")
+ORDER = build.team_end(reason="it rains")
 
 
 class Live:
@@ -37,7 +37,7 @@ class Live:
 
     def robot(self, name, *, state="ended"):
         measured = published(STREAMS[name])
-        self.tell(m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True))
+        self.tell(build.liveliness(node=f"robot/{name}"))
         node = RobotNode(config(name))
         out = driven(node, measured, end=False)
         out += node.handle(head(name, len(measured), state))
@@ -105,14 +105,14 @@ def test_nothing_waits_for_a_robot_whose_driver_has_not_come_or_is_away():
     team = Live("r1", "r2", "r3").robot("r1", state="open")
     attendance = team.centre.attendance
     assert attendance.watermark_ns == attendance.robots["r1"].progress.stamp_ns
-    team.tell(m.Liveliness(stamp_ns=0, node="source/r1", alive=False))
+    team.tell(build.liveliness(node="source/r1", alive=False))
     assert attendance.watermark_ns == float("inf")
 
 
 def robot_with(count):
     node = RobotNode(config("r1"))
     measured = published(STREAMS["r1"])
-    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=True))
+    node.handle(build.liveliness(node="source/r1"))
     for each in measured[:count]:
         node.handle(each)
     return node, measured
@@ -123,7 +123,7 @@ def test_a_robot_asks_for_what_its_driver_has_numbered_and_it_has_not():
     assert node.request() is None
     node.handle(head("r1", 12, "open"))
     assert (node.request().first, node.request().last) == (5, 11)
-    node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False))
+    node.handle(build.liveliness(node="source/r1", alive=False))
     assert node.request() is None
     assert "its driver is away after measurement 4" in node.status().warnings[0]
     assert len(measured) > 12
@@ -132,9 +132,7 @@ def test_a_robot_asks_for_what_its_driver_has_numbered_and_it_has_not():
 def test_a_robot_that_is_told_to_end_waits_for_its_driver_and_ends_without_one():
     node, measured = robot_with(5)
     assert of(node.handle(ORDER), ch.ROBOT_DONE) == []
-    (done,) = of(
-        node.handle(m.Liveliness(stamp_ns=0, node="source/r1", alive=False)), ch.ROBOT_DONE
-    )
+    (done,) = of(node.handle(build.liveliness(node="source/r1", alive=False)), ch.ROBOT_DONE)
     assert done.measurements == 5
     node, measured = robot_with(len(STREAMS["r1"]))
     node.handle(ORDER)

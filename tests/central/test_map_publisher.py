@@ -111,7 +111,7 @@ def test_no_map_has_less_than_the_one_before_it():
         now = {(each.robot, each.incarnation): each.sequence for each in after.members}
         assert all(now[each.robot, each.incarnation] >= each.sequence for each in before.members)
     assert not maps[-1].provisional
-    withdrawal = m.Withdrawal(stamp_ns=END_NS, robot="r1", by="operator", reason="a test")
+    withdrawal = build.withdrawal(stamp_ns=END_NS)
     found.withdraw(withdrawal)
     (last,) = of(found.publish_final(END_NS), ch.FINAL_MAP)
     assert {each.robot for each in last.members} == {"r2"}

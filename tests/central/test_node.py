@@ -20,7 +20,7 @@ END = build.end(**{name: len(each) for name, each in STREAMS.items()})
 
 
 def alive(name, *, here=True):
-    return m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=here)
+    return build.liveliness(node=f"robot/{name}", alive=here)
 
 
 def progress(name, stamp_s, submaps, incarnation=1):
@@ -158,7 +158,7 @@ def test_a_robot_that_was_withdrawn_and_has_left_is_not_waited_for_and_not_lost(
     centre.hears(
         *SUBMAPS["r1"],
         *SUBMAPS["r2"][:2],
-        m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="flat"),
+        build.withdrawal(robot="r2", reason="flat"),
     )
     centre.hears(done("r1"), END)
     assert not centre.node.finished, "it is there, and may still say what it did"
@@ -197,7 +197,7 @@ def test_the_last_word_of_an_earlier_incarnation_is_not_the_last():
     centre.hears(*SUBMAPS["r1"], *SUBMAPS["r2"], done("r1"), end, done("r2"))
     assert not centre.node.finished
     second = [msgspec.structs.replace(x, incarnation=2) for x in SUBMAPS["r2"][:2]]
-    start = m.InitialPose(stamp_ns=0, robot="r2", incarnation=2, number=0, pose=b"", covariance=b"")
+    start = build.initial_pose(robot="r2", incarnation=2)
     centre.hears(start, *second, done("r2", 2, incarnation=2))
     assert centre.node.finished
     again = joined()
@@ -214,7 +214,7 @@ def test_the_submaps_of_a_robot_are_given_to_its_next_life():
     centre.hears(SUBMAPS["r1"][0], SUBMAPS["r1"][1], SUBMAPS["r1"][3])
 
     def answer(robot):
-        request = encoded(m.SubmapsRequest(stamp_ns=0, robot=robot))
+        request = encoded(build.submaps_request(robot=robot))
         return [decoded(reply) for reply in centre.node.answer_submaps(request)]
 
     assert answer("r1") == [STARTS["r1"], *SUBMAPS["r1"][:2]]
@@ -290,7 +290,7 @@ def test_watermark_and_end_are_those_of_a_look_at_every_robot():
                         node=f"robot/{robot}", alive=draw.random() < 0.7
                     )
                 case 1 if draw.random() < 0.1:
-                    message = m.GivenUp(stamp_ns=0, node=f"robot/{robot}", by="x", reason="y")
+                    message = build.given_up(node=f"robot/{robot}", by="x", reason="y")
                 case 8:
                     message = END_ATTENDANCE
                 case 9:

@@ -26,6 +26,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, ids
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import WireError, decoded, encoded
+from tests import build
 from tests.air import Air
 from tests.bits import SETS
 from tests.peer_team import PeerTeam, peer_world
@@ -292,7 +293,7 @@ def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
     fold.store.add(first_day()[1])
     joined = fold.make_map("final")[-1].message
     assert numbers(joined) == numbers(final_map(samples))
-    order = m.Withdrawal(stamp_ns=0, robot="map-site", by="operator", reason="old")
+    order = build.withdrawal(robot="map-site", reason="old")
     fold.store.add(order)
     without = fold.make_map("final")[-1].message
     assert numbers(without) == numbers(final_map(second_day(loaded=False)[0]))

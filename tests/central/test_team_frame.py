@@ -60,7 +60,7 @@ class Team:
         self.map: m.FusedMap | None = None
         self.log: list[Outgoing] = []
         for name in kinds:
-            token = m.Liveliness(stamp_ns=0, node=ch.robot_node(name), alive=True)
+            token = build.liveliness(node=ch.robot_node(name))
             self.to_centre(token)
 
     def measure(self, name: str) -> None:
@@ -97,7 +97,7 @@ class Team:
         return build.progress(node="central", robot=submap.robot, submaps=submap.sequence + 1)
 
     def order_without(self, name: str) -> None:
-        order = m.Withdrawal(stamp_ns=0, robot=name, by="operator", reason="a test")
+        order = build.withdrawal(robot=name)
         self.to_centre(order)
 
     def check(self) -> None:

@@ -130,7 +130,7 @@ def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final):
 
 
 def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been():
-    order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="")
+    order = build.withdrawal(robot="r2", reason="")
     alone = _rule()
     for submap in two_robots()["r1"]:
         alone.store.add(submap)

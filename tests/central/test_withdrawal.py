@@ -164,9 +164,7 @@ def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> MapPub
 
 def test_a_map_names_who_was_withdrawn_in_its_digest_too():
     samples = team_run()
-    orders = [
-        m.Withdrawal(stamp_ns=k, robot="r3", by="operator", reason=f"reason {k}") for k in range(2)
-    ]
+    orders = [build.withdrawal(stamp_ns=k, robot="r3", reason=f"reason {k}") for k in range(2)]
     plain, once, twice = (rule_with(samples, *orders[:k]) for k in range(3))
     maps = [rule.publish_final(0)[-1].message for rule in (plain, once, twice)]
     assert [fused.withdrawn for fused in maps] == [(), ("r3",), ("r3",)]
@@ -204,7 +202,7 @@ def test_no_number_of_robots_withdraws_a_robot_by_what_they_report():
     for robot in ("r1", "r2", "r3", "r4"):
         report = build.withdrawal_heard(robot=robot, withdrawn="r2", reason="it never was")
         assert node.handle(report) == []
-    order = m.Withdrawal(stamp_ns=0, robot="r2", by="operator", reason="a flat wheel")
+    order = build.withdrawal(robot="r2", reason="a flat wheel")
     (repeated,) = node.handle(order)
     assert (repeated.key, repeated.message) == ("central/withdrawal/r2", order)
 

@@ -359,7 +359,7 @@ def test_a_stream_that_an_earlier_run_received_is_not_delivered_to_the_next(tmp_
         bus.declare_alive("recorder")
 
         def records(run):
-            status = build.status(node="recorder", state="recording", figures={}, run=run)
+            status = build.status(node="recorder", state="recording", run=run)
             bus.publish(Outgoing(ch.STATUS, "recorder", status))
 
         records("first")
@@ -403,7 +403,7 @@ def test_a_stream_that_is_continued_where_no_team_is_begins_again_in_a_later_run
         robot._link._connect = endpoint  # the run begins where the driver is
         with ZenohBus("lab", endpoint) as bus:
             bus.declare_alive("recorder")
-            status = build.status(node="recorder", state="recording", figures={}, run="second")
+            status = build.status(node="recorder", state="recording", run="second")
             bus.publish(Outgoing(ch.STATUS, "recorder", status))
             wait_until(lambda: robot._journal is not earlier)
             with pytest.warns(DriverWarning, match="of an earlier run of team lab.* unknown pose"):
@@ -432,9 +432,9 @@ def test_without_a_centre_the_robots_own_final_map_is_the_end(tmp_path):
     final = over | {"sha256": bytes(32), "submaps": 2}
     node.handle(build.concluded(robot="r2", **final))
     assert not node.is_delivered
-    node.handle(build.concluded(robot="r1", **final))
+    node.handle(build.concluded(**final))
     assert node.is_delivered
-    node.handle(build.set_summary(node="robot/r1", holdings=(), statements=(), **over))
+    node.handle(build.set_summary(node="robot/r1", **over))
     assert node.waits_for == "robot/r1"
     driver.close()
 

@@ -17,9 +17,9 @@ LATENCY_NS = 200_000_000
 def measured(journal, kind, stamp_ns):
     common = {"stamp_ns": stamp_ns, "robot": "r1", "incarnation": 1, "number": 0}
     message = {
-        j.START: lambda: build.initial_pose(pose=b"", covariance=b"", **common),
+        j.START: lambda: build.initial_pose(**common),
         j.ODOMETRY: lambda: build.odometry(duration_ns=1, forward=0.0, yaw_rate=0.0, **common),
-        j.OBSERVATIONS: lambda: build.observations(ids=b"", ranges=b"", bearings=b"", **common),
+        j.OBSERVATIONS: lambda: build.observations(**common),
     }[kind]()
     journal.append(kind, stamp_ns, encoded(message))
 

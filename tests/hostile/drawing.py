@@ -144,10 +144,8 @@ class Team:
             mean=mean,
             covariance=packed(covariance(rng, n)),
             nodes=nodes,
-            sightings=0,
             biases=biases,
             sensitivity=numbers(rng, n * len(biases)),
-            gated=0,
         )
 
     def grow(self) -> None:

@@ -38,7 +38,6 @@ def submap(robot, sequence=0, ids=(1, 2, 3), mean=None, P=None, nodes=(), **fiel
     return build.submap(
         stamp_ns=begins + 10 * S,
         robot=robot,
-        incarnation=1,
         sequence=sequence,
         first_measurement=sequence * 20 + (sequence > 0),
         last_measurement=sequence * 20 + 20,

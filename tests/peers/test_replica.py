@@ -39,7 +39,7 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there():
     )
     for each in (start("r2"), *(m_ for k in range(4) for m_ in parcel("r2", k))):
         honest.take(each, "robot/r2")
-    claim = build.holding(robot="r2", sequences=(0, 2_000_000), newest_ns=0)
+    claim = build.holding(robot="r2", sequences=(0, 2_000_000))
     lie = build.set_summary(node="robot/r3", holdings=(claim,) * 3)
     asked: list[str] = []
     for second in range(12):

@@ -134,9 +134,7 @@ def test_a_recorder_that_was_started_again_counts_what_is_in_the_earlier_parts()
 
 def test_an_undecodable_measurement_is_no_substitute_for_a_sound_one():
     key = c.ODOMETRY.key("r1")
-    first, second = (
-        encoded(build.odometry(robot="r1", incarnation=0, number=number)) for number in (0, 1)
-    )
+    first, second = (encoded(build.odometry(incarnation=0, number=number)) for number in (0, 1))
     inventory = Inventory()
     nested = first[:-1] + b"\x91" * 5_000
     for payload in (first[:-1], nested, second):

@@ -17,6 +17,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
+from tests import build
 from tests.support import fused_map, packed, spd
 from tests.teams import config, driven, of, published, stream
 
@@ -26,7 +27,7 @@ END = m.End(
     stamp_ns=12_000_000_000,
     streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=len(MEASUREMENTS)),),
 )
-CENTRE = m.Liveliness(stamp_ns=0, node="central", alive=True)
+CENTRE = build.liveliness(node="central")
 
 
 def payloads(out, channel=ch.SUBMAP):
@@ -40,14 +41,12 @@ def lonely():
 
 def prior(sequence=0, incarnation=1, scale=1.0, at=0.0, ids=(1, 2)):
     n = 3 + 2 * len(ids)
-    return m.Prior(
-        stamp_ns=0,
-        robot="r1",
+    return build.prior(
         incarnation=incarnation,
         sequence=sequence,
         digest=b"whatever",
-        ids=from_ids(ids),
-        mean=from_floats(np.full(n, at)),
+        ids=ids,
+        mean=np.full(n, at),
         covariance=packed(scale * spd(n)),
     )
 
@@ -75,11 +74,9 @@ noise = st.one_of(
     ),
     st.builds(fused, st.sampled_from([(), (1, 2), (77,)]), st.floats(-1e9, 1e9)),
     st.just(CENTRE),
-    st.just(m.Liveliness(stamp_ns=0, node="central", alive=False)),
+    st.just(build.liveliness(node="central", alive=False)),
     st.builds(
-        lambda n: m.Progress(
-            stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=n
-        ),
+        lambda n: build.progress(node="central", submaps=n),
         st.integers(0, 100),
     ),
 )
@@ -94,7 +91,7 @@ def test_whatever_comes_back_under_join_no_submap_changes_by_a_bit(interjections
         for at, message in interjections:
             out += node.handle(message) if at == i else []
     out += node.handle(END)
-    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False))
+    out += node.handle(build.liveliness(node="central", alive=False))
     assert payloads(out) == lonely()
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
@@ -150,7 +147,7 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
     front_end = msgspec.structs.replace(config().front_end, keyframe_s=keyframe_s)
     fusion = {"hybrid": "join", "hybrid-thesis": "kalman-per-axis"}.get(estimator, "alone")
     node = node_for(config(front_end=front_end, estimator=estimator, fusion=fusion))
-    node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False))
+    node.handle(build.liveliness(node="central", alive=False))
     node.handle(
         m.KnownMap(stamp_ns=0, ids=from_ids([1, 2]), positions=from_floats([5.0, 3.0, 9.0, -2.0])),
     )
@@ -225,20 +222,16 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     out = [o for r in MEASUREMENTS for o in node.handle(r)] + node.handle(END)
     assert len(of(out, ch.SUBMAP)) == 2
     out += node.handle(
-        m.Progress(
-            stamp_ns=0, node="central", robot="r1", incarnation=7, measurements=0, submaps=9
-        ),
+        build.progress(node="central", incarnation=7, submaps=9),
     )
     assert len(of(out, ch.SUBMAP)) == 2, "credit of another incarnation is none"
     out += node.handle(
-        m.Progress(
-            stamp_ns=0, node="central", robot="r1", incarnation=1, measurements=0, submaps=1
-        ),
+        build.progress(node="central", submaps=1),
     )
     assert len(of(out, ch.SUBMAP)) == 3
-    out += node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False))
+    out += node.handle(build.liveliness(node="robot/r2", alive=False))
     assert len(of(out, ch.SUBMAP)) == 3, "another node's token is not the centre's"
-    out += node.handle(m.Liveliness(stamp_ns=0, node="central", alive=False))
+    out += node.handle(build.liveliness(node="central", alive=False))
     assert payloads(out) == lonely()
     assert len(of(out, ch.ROBOT_DONE)) == 1
 
@@ -249,9 +242,7 @@ def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
     second = [
         msgspec.structs.replace(r, incarnation=2, number=r.number - 15) for r in MEASUREMENTS[15:]
     ]
-    second[0] = m.InitialPose(
-        stamp_ns=second[0].stamp_ns, robot="r1", incarnation=2, number=0, pose=b"", covariance=b""
-    )
+    second[0] = build.initial_pose(stamp_ns=second[0].stamp_ns, incarnation=2)
     out += [o for r in second for o in node.handle(r)]
     ends = (m.StreamEnd(robot="r1", incarnation=2, measurements=len(second)),)
     out += node.handle(m.End(stamp_ns=0, streams=ends))
@@ -354,30 +345,26 @@ def test_a_resumed_robot_has_what_its_earlier_life_sent_for_whoever_asks():
         sent += node.handle(measurement)
 
     def answer(**wanted):
-        request = encoded(m.SubmapsRequest(stamp_ns=0, robot="r1", **wanted))
+        request = encoded(build.submaps_request(**wanted))
         return [decoded(reply) for reply in node.answer_submaps(request)]
 
     assert answer() == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)]
     assert answer(incarnation=1, first=2) == [MEASUREMENTS[0], *of(sent, ch.SUBMAP)[2:]]
     assert answer(incarnation=2) == []
-    assert node.answer_submaps(encoded(m.SubmapsRequest(stamp_ns=0, robot="r2"))) == []
+    assert node.answer_submaps(encoded(build.submaps_request(robot="r2"))) == []
 
 
 def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
     node = RobotNode(config(), "rendezvous")
     for measurement in MEASUREMENTS:
         node.handle(measurement)
-    assert node.answer_submaps(encoded(m.SubmapsRequest(stamp_ns=0, robot="r1"))) == [
-        encoded(MEASUREMENTS[0])
-    ]
+    assert node.answer_submaps(encoded(build.submaps_request())) == [encoded(MEASUREMENTS[0])]
 
 
 def rolling(seed: int) -> list[m.Measurement]:
     """Odometry at 50 Hz with stops, leaps and implausible speeds, and scans in any order."""
     rng = np.random.default_rng(seed)
-    found: list[m.Measurement] = [
-        m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
-    ]
+    found: list[m.Measurement] = [build.initial_pose(incarnation=0)]
     tick_ns, now_ns = 20_000_000, 0
 
     def add(kind, stamp_ns, **fields):

@@ -7,7 +7,7 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.robot.maps import CONDENSED
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from tests import build
 from tests.teams import config, driven, of, published, stream
 
 
@@ -37,13 +37,9 @@ def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages():
     assert len(of(out, ch.SUBMAP)) == 20
     del out
     assert local_maps() - before <= 1
-    prior = m.Prior(
-        stamp_ns=0,
-        robot="r1",
-        incarnation=1,
+    prior = build.prior(
         sequence=16,
         digest=bytes(8),
-        ids=b"",
         mean=np.zeros(3).tobytes(),
         covariance=np.eye(3)[np.triu_indices(3)].tobytes(),
     )

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from click.testing import CliRunner
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner
@@ -120,9 +119,6 @@ def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
     assert Cases(tmp_path).found(counted(2.0)) is None
     monkeypatch.setattr("teamslam.sim.studies.experiments.task.program_of", lambda _: "0" * 16)
     assert Cases(tmp_path).found(counted(1.0)) is None
-
-
-RUN = CliRunner()
 
 
 def task(value: float, cost: float = 1.0) -> Task:

@@ -126,9 +126,8 @@ def test_every_order_of_an_operator_is_stored_with_its_signature():
 
 
 def test_the_router_can_not_be_made_to_reply_with_another_channel():
-    kept = m.Kept(
-        stamp_ns=0, key="central/end", wall_ns=0, counter=0,
-        payload=encoded(build.team_end(reason="so")),
+    kept = build.kept(
+        key="central/end", payload=encoded(build.team_end(reason="so"))
     )  # fmt: skip
     with pytest.raises(WireError, match="stores nothing on the key"):
         read_reply(ch.KEPT, "", encoded(kept), 0)

@@ -50,8 +50,8 @@ def scenario(*, peers: bool) -> Sample:
 
 
 HONEST = [part for robot in ROBOTS for part in (final(robot), concluded(robot))]
-WITHDRAWN = m.Withdrawal(stamp_ns=0, robot="r3", by="operator", reason="broken")
-GIVEN_UP = m.GivenUp(stamp_ns=0, node="robot/r3", by="operator", reason="lost")
+WITHDRAWN = build.withdrawal(robot="r3", reason="broken")
+GIVEN_UP = build.given_up(node="robot/r3", reason="lost")
 
 
 def judged(*samples: Sample) -> Agreement:

@@ -19,7 +19,6 @@ from teamslam.sim.publisher.node import WorldNode
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.team.config import RobotConfig, Sensor
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
@@ -137,13 +136,13 @@ def presence(*behind: tuple[float, float]) -> Presence:
     """A team's drivers, so many seconds behind the wall clock at two moments 2 s apart."""
     found = Presence()
     for node in ("central", "robot/r1", "robot/r2", "robot/r3"):
-        found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
+        found._take_message(build.liveliness(node=node), 0)
     for k, each in enumerate(behind, 1):
         node = f"source/r{k}"
-        found._take_message(m.Liveliness(stamp_ns=0, node=node, alive=True), 0)
+        found._take_message(build.liveliness(node=node), 0)
         for wall_s, late_s in zip((NOW_S, NOW_S + 2), each, strict=True):
             stamp_ns = round((wall_s - late_s) * S)
-            status = build.status(stamp_ns=stamp_ns, node=node, state="measuring", warnings=())
+            status = build.status(stamp_ns=stamp_ns, node=node, state="measuring")
             found._take_message(status, wall_s * S)
     return found
 

@@ -283,12 +283,12 @@ def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone():
 
 def test_what_a_driver_never_got_is_a_note():
     figures = {"messages": 90.0, "messages_lost": 9.0, "messages_dropped": 1.0}
-    said = m.Status(stamp_ns=1, node="source/r1", state="ended", figures=figures, warnings=())
+    said = build.status(stamp_ns=1, node="source/r1", state="ended", figures=figures)
     (note,) = evaluate(
         world_log(scenario()) + samples([Outgoing(ch.STATUS, "source/r1", said)])
     ).notes
     assert note.startswith("r1: 10 messages of its topics are not in its stream, beside 90")
-    none = m.Status(stamp_ns=1, node="source/r1", state="ended", figures={}, warnings=())
+    none = build.status(stamp_ns=1, node="source/r1", state="ended")
     assert not evaluate(
         world_log(scenario()) + samples([Outgoing(ch.STATUS, "source/r1", none)])
     ).notes

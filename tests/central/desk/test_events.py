@@ -11,7 +11,7 @@ def told(*messages: m.Message) -> list[tuple[str, str]]:
 
 
 def alive(there: bool, node: str = "robot/r1") -> m.Liveliness:
-    return m.Liveliness(stamp_ns=0, node=node, alive=there)
+    return build.liveliness(node=node, alive=there)
 
 
 def test_a_robot_joins_is_lost_and_comes_back():
@@ -59,7 +59,7 @@ def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map():
 
 
 def test_a_withdrawal_is_told_once_with_its_reason():
-    said = m.Withdrawal(stamp_ns=3, robot="r2", by="central", reason="its wheels slip")
+    said = build.withdrawal(stamp_ns=3, robot="r2", by="central", reason="its wheels slip")
     assert told(fused(["r1", "r2"]), said, said, fused(["r1"]))[2:] == [
         ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
     ]

@@ -1,6 +1,7 @@
 from teamslam.central.desk.evaluation.events import EventDetector
 from teamslam.central.desk.view.page_frames import sets_of
 from teamslam.team.wire import messages as m
+from tests import build
 from tests.support import examples
 
 FUSED = next(each for each in examples() if isinstance(each, m.FusedMap))
@@ -33,7 +34,7 @@ def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone():
         why="share 0.41 < 0.5 after 3 ticks",
     )
     fields = {name: getattr(FUSED, name) for name in m.FusedMap.__struct_fields__}
-    again = m.FusedMap(**(fields | {"decisions": (decision, undone)}))
+    again = build.fused_map(**(fields | {"decisions": (decision, undone)}))
     assert [
         each.kind for each in detector.take(again, 0) if each.kind in ("closure", "undone")
     ] == ["undone"]

@@ -36,9 +36,7 @@ steering = st.builds(
     numbers,
 )
 scan = st.builds(
-    lambda number: build.observations(
-        stamp_ns=10 * number, incarnation=0, number=number, ids=b"", ranges=b"", bearings=b""
-    ),
+    lambda number: build.observations(stamp_ns=10 * number, incarnation=0, number=number),
     numbers,
 )
 logs = st.lists(st.one_of(plain, plain, steering, scan), max_size=30)

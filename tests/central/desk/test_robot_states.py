@@ -18,6 +18,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
+from tests import build
 from tests.central.test_withdrawal import run, scenario
 from tests.sim.reruns import changed
 
@@ -74,7 +75,7 @@ def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_prin
     streams = simulate(of.world, of.robots, of.seed)
     streams = without_starts(streams, "r2", "r3")
     wrong = list(run_team(of, streams))
-    order = m.Withdrawal(stamp_ns=0, robot="r1", by="operator", reason="its wheel is flat")
+    order = build.withdrawal(reason="its wheel is flat")
     final = final_map(wrong)
     gone = msgspec.structs.replace(
         final,

@@ -194,7 +194,7 @@ def test_the_view_waits_for_the_slowest_robot_at_work():
     assert robots_at(shown(node, *ready)) == [0]
     assert robots_at(shown(node, *[(ch.OWN_POSE, pose(t, t)) for t in range(1, 9)])) == []
     assert robots_at(shown(node, (ch.OWN_POSE, pose(3, 3, "r2")))) == [1, 2, 3]
-    lost = (ch.ALIVE, m.Liveliness(stamp_ns=0, node="robot/r2", alive=False))
+    lost = (ch.ALIVE, build.liveliness(node="robot/r2", alive=False))
     assert robots_at(shown(node, lost)) == [4, 5, 6, 7, 8]
 
 

@@ -277,15 +277,13 @@ def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Chan
         means=transform_points(MAP_FROM_TRUTH, TRUE),
         covariance=[1.0, 0.0, 1.0] * 3
     )  # fmt: skip
-    start = build.initial_pose(
-        robot="r1", incarnation=1, pose=from_floats(np.zeros(3)) if known else b""
-    )
+    start = build.initial_pose(pose=from_floats(np.zeros(3)) if known else b"")
     truth = m.TruthLandmarks(stamp_ns=0, ids=from_ids([1, 2, 3]), positions=from_floats(TRUE))
     return [
         (ch.START, start),
         *([(ch.TRUTH_LANDMARKS, truth)] if landmarks else []),
-        (ch.TRUTH, build.truth(robot="r1", stamps=at, poses=true_path)),
-        (ch.TRAJECTORY, build.trajectory(robot="r1", stamps=at, poses=path)),
+        (ch.TRUTH, build.truth(stamps=at, poses=true_path)),
+        (ch.TRAJECTORY, build.trajectory(stamps=at, poses=path)),
         (ch.FINAL_MAP, fused),
     ]
 
@@ -316,8 +314,7 @@ def test_without_an_alignment_the_truth_is_left_out():
 def test_foxgloves_true_landmarks_are_in_the_frame_of_the_map(known, moved):
     node = ViewerNode()
     pose = build.pose_estimate(
-        stamp_ns=2 * 10**9, robot="r1", frame="r1/1", in_team_frame=True,
-        pose=np.zeros(3), covariance=np.eye(3)
+        stamp_ns=2 * 10**9, frame="r1/1", pose=np.zeros(3), covariance=np.eye(3)
     )  # fmt: skip
     views = []
     for channel, message in [
@@ -337,8 +334,7 @@ def test_smoothed_poses_at_ends_of_submaps_are_dots_and_those_at_keyframes_a_lin
     if at_ends:
         trajectory = msgspec.structs.replace(trajectory, crosses=from_floats(np.zeros((3, 9))))
     pose = build.pose_estimate(
-        stamp_ns=2 * 10**9, robot="r1", frame="r1/1", in_team_frame=True,
-        pose=np.zeros(3), covariance=np.eye(3)
+        stamp_ns=2 * 10**9, frame="r1/1", pose=np.zeros(3), covariance=np.eye(3)
     )  # fmt: skip
     log = [*before, (ch.TEAM_POSE, pose), (channel, trajectory), last]
     (path,) = (each for each in told_of(*log) if each["k"] == "path")

@@ -7,7 +7,6 @@ from teamslam.sim.publisher.node import Configurations, WorldNode, expected_node
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
 from tests import build
 from tests.scenarios import with_world
 from tests.teams import stream, world_of
@@ -23,7 +22,7 @@ def world() -> WorldNode:
     announced = build.configuration(node="world", incarnation=0)
     node = WorldNode(STREAMS, expected, announced, configurations=configurations)
     for name in expected:
-        node.handle(m.Liveliness(stamp_ns=0, node=name, alive=True))
+        node.handle(build.liveliness(node=name))
     return node
 
 

@@ -20,7 +20,7 @@ def world(streams=STREAMS, expected=frozenset(), **options):
 
 
 def alive(node, name, *, here=True):
-    node.handle(m.Liveliness(stamp_ns=0, node=name, alive=here))
+    node.handle(build.liveliness(node=name, alive=here))
 
 
 def all_of(node, clock=0.0):
@@ -259,9 +259,7 @@ def test_a_world_that_is_started_again_goes_on_from_what_everybody_has():
     least = {"r1": 7, "r2": 5}
     assert out[len(starts) :] == [r for r in before if r.number >= least[r.robot]]
     assert node.status().figures["measurements"] == len(before)
-    request = encoded(
-        m.MeasurementsRequest(stamp_ns=0, robot="r1", incarnation=1, first=0, last=-1)
-    )
+    request = encoded(build.measurements_request())
     assert [decoded(reply).number for reply in node.measurements(request)] == list(range(26))
 
 
@@ -287,5 +285,5 @@ def test_a_world_begins_without_a_node_that_is_given_up():
     node = world(expected=frozenset({"robot/r1", "recorder"}))
     alive(node, "robot/r1")
     assert node.publish(0.0) == []
-    node.handle(m.GivenUp(stamp_ns=0, node="recorder", by="launch", reason="it died 5 times"))
+    node.handle(build.given_up(node="recorder", by="launch", reason="it died 5 times"))
     assert measurements(node.publish(0.0))

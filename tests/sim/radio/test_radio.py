@@ -61,7 +61,7 @@ def test_what_is_out_of_reach_does_not_come_in_and_nobody_hears_its_question():
         said = submap(sequence, "r2", 1)
         mate.publish(Outgoing(ch.SUBMAP, "r2", _stamped(said, stamp_ns)))
         door.publish(Outgoing(ch.OWN_POSE, "r1", _pose(stamp_ns)))
-        asked = m.MembersRequest(stamp_ns=stamp_ns, node="robot/r1", requested=())
+        asked = build.members_request(stamp_ns=stamp_ns)
         door.request(ch.MEMBERS, "robot/r2", asked)
     stamps = [sample.stamp_ns for sample in door.receive(0.0)]
     assert [(t - reach.first_ns) // SECOND for t in stamps] == [3, 4, 5]

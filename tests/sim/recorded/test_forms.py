@@ -36,7 +36,7 @@ def seeing(at_s: float, kind: type[m.Measurement], **fields: Any) -> m.Measureme
 
 
 def stream(measurements: Sequence[m.Measurement]) -> list[m.Message]:
-    begin = m.InitialPose(stamp_ns=0, robot="r1", incarnation=1, number=0, pose=b"", covariance=b"")
+    begin = build.initial_pose()
     kinds = m.AnyOdometry
     ordered = sorted(measurements, key=lambda each: (each.stamp_ns, isinstance(each, kinds)))
     fields = [{name: getattr(each, name) for name in each.__struct_fields__} for each in ordered]

@@ -7,7 +7,6 @@ from teamslam.central.config import CentralConfig
 from teamslam.sim.studies.rules.map_rules import RULES, RoundsCentre
 from teamslam.team import translate
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
@@ -22,7 +21,7 @@ def centre(name="kalman", robots=ROBOTS):
 
 
 def give_up(found, robot):
-    order = m.GivenUp(stamp_ns=0, node=f"robot/{robot}", by="operator", reason="lost")
+    order = build.given_up(node=f"robot/{robot}", reason="lost")
     return found.handle(order)
 
 

@@ -15,7 +15,7 @@ from tests import build
 from tests.support import packed, spd
 
 END = build.end(r1=9, r2=9)
-ALIVE = [m.Liveliness(stamp_ns=0, node=f"robot/{name}", alive=True) for name in ("r1", "r2")]
+ALIVE = [build.liveliness(node=f"robot/{name}") for name in ("r1", "r2")]
 
 
 def start(robot, *, known=True):
@@ -86,11 +86,9 @@ def test_a_robot_that_is_lost_leaves_the_map_that_it_has_sent(rule):
     messages = [x for x in TEAM if x != LAST[1] and x != done("r2", 6)]
     node, _ = heard(rule, messages)
     assert not node.finished
-    node.handle(m.Liveliness(stamp_ns=0, node="robot/r2", alive=False))
+    node.handle(build.liveliness(node="robot/r2", alive=False))
     assert not node.finished
-    node.handle(
-        m.GivenUp(stamp_ns=0, node="robot/r2", by="operator", reason="it fell into the water")
-    )
+    node.handle(build.given_up(node="robot/r2", reason="it fell into the water"))
     assert (node.final.lost, node.final.provisional) == (("r2",), True)
     assert node.final.members[1] == m.VersionEntry(robot="r2", incarnation=1, sequence=3)
 
