@@ -249,7 +249,9 @@ def team_figures(evaluation: Evaluation) -> Figures:
         ),
         "final_map_sha256": None if evaluation.map is None else evaluation.map.payload_sha256,
         "not_joined": [] if fused is None else [r for r in fused.reasons if "not joined" in r],
-        "withdrawn": [] if fused is None else list(fused.withdrawn),
+        "withdrawn": [
+            name for name, robot in evaluation.states.items() if robot.state == "withdrawn"
+        ],
         "reasons": [] if fused is None else list(fused.reasons),
         "robots": {name: _robot_figures(robot) for name, robot in evaluation.robots.items()},
     }
