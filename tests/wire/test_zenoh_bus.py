@@ -19,7 +19,7 @@ from teamslam.team.wire.zenoh import bus as zenoh_bus
 from teamslam.team.wire.zenoh import recovery as recovery_module
 from teamslam.team.wire.zenoh.attachment import Attachment, pack, unpack
 from teamslam.team.wire.zenoh.bus import ZenohBus
-from teamslam.team.wire.zenoh.recovery import Heartbeat, Recovery
+from teamslam.team.wire.zenoh.recovery import Recovery
 from teamslam.team.wire.zenoh.router import router
 from teamslam.team.wire.zenoh.session import client
 from tests import build
@@ -288,10 +288,10 @@ def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
     monkeypatch.setattr(recovery_module, "MOST_PUBLISHERS", 15)
     monkeypatch.setattr(recovery_module, "MOST_ASKED", 4)
     with client(endpoint, 5.0, None) as session:
-        recovery = Recovery(session, "team/t/", lambda item: None)
+        recovery = Recovery(session, "team/t/", lambda sample: None, lambda work: None)
         for key in ("robot/r1/submap", "robot/r2/submap"):
             for k in range(1_000):
-                recovery.take_heartbeat(Heartbeat(key, f"{key}/{k}", 2**32 - 2))
+                recovery.take_heartbeat(key, f"{key}/{k}", 2**32 - 2)
         lost = {key: len(intervals) for key, intervals in recovery.find_missing().items()}
         assert lost == {"robot/r1/submap": 10, "robot/r2/submap": 5}
         assert recovery.untracked == 1_985
@@ -306,13 +306,13 @@ def test_the_publishers_of_a_node_and_of_all_nodes_are_tracked_up_to_a_bound(
 def test_a_heartbeat_of_a_publisher_that_is_another_keys_counts_for_nothing(endpoint):
     with client(endpoint, 5.0, None) as session:
         source = zenoh.SourceInfo(session.declare_publisher("any").id, 0)
-        recovery = Recovery(session, "team/t/", lambda item: None)
+        recovery = Recovery(session, "team/t/", lambda sample: None, lambda work: None)
         own = Sample("robot/r1/submap", b"", 0, 0, 0)
         assert recovery.take_sample(own, source) == [own]
         name = f"{source.source_id.zid}/{source.source_id.eid}"
-        recovery.take_heartbeat(Heartbeat("robot/r2/submap", name, 25))
+        recovery.take_heartbeat("robot/r2/submap", name, 25)
         assert recovery.find_missing() == {}
-        recovery.take_heartbeat(Heartbeat("robot/r1/submap", name, 2))
+        recovery.take_heartbeat("robot/r1/submap", name, 2)
         assert recovery.find_missing() == {"robot/r1/submap": [(1, 2)]}
 
 
@@ -320,13 +320,13 @@ def test_a_team_that_speaks_faster_than_it_is_read_keeps_nobody(endpoint, monkey
     """Samples that arrive during a read wait for the next one, so that a slow reader returns."""
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
         flowing(source, sink)
-        read, back = sink._take, threading.Event()
+        read, back = sink._take_sample, threading.Event()
 
-        def slowly(item: object, samples: list[Sample]) -> None:
+        def slowly(received: zenoh.Sample) -> list[Sample]:
             time.sleep(0.005)
-            read(item, samples)
+            return read(received)
 
-        monkeypatch.setattr(sink, "_take", slowly)
+        monkeypatch.setattr(sink, "_take_sample", slowly)
 
         def speak() -> None:
             until = time.monotonic() + 10.0

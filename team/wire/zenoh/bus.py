@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Self
 
@@ -24,7 +24,7 @@ from teamslam.team.wire.messages import Liveliness, Message, Tally
 from teamslam.team.wire.text import cut
 from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
 from teamslam.team.wire.zenoh.delivery import PRIORITY, Publisher, declare_publisher, subscribe
-from teamslam.team.wire.zenoh.recovery import CacheAnswer, Heartbeat, Recovery
+from teamslam.team.wire.zenoh.recovery import Recovery, Work
 from teamslam.team.wire.zenoh.session import RouterLink, client
 
 if TYPE_CHECKING:  # not needed without keys
@@ -41,41 +41,6 @@ _FLUSH_S = 10.0  # a closing bus waits this long for a router that reads slowly 
 MOST_WAITING = 1_000
 """Queue length beyond which an observing node drops dispensable samples, of some 10 kB each."""
 MOST_KEYS = 16_384  # most keys on which a bus receives samples; a team of 100 robots has 4,500
-
-
-@dataclass(frozen=True)
-class _Token:
-    sample: zenoh.Sample
-
-
-@dataclass(frozen=True, repr=False)
-class _Question:
-    query: zenoh.Query
-    answer: Answer
-
-    def reply(self) -> None:
-        """Answer the query; the sender of an invalid request receives the error."""
-        request = b"" if self.query.payload is None else self.query.payload.to_bytes()
-        with self.query as query:
-            try:
-                for payload in self.answer(request):
-                    query.reply(query.key_expr, payload)  # blocks as its query does
-            except ValueError as error:
-                query.reply_err(str(error))
-
-
-@dataclass(frozen=True)
-class _Reply:
-    """One reply to a request; without a payload its end, or an error with its reason."""
-
-    channel: Channel
-    name: str
-    payload: bytes | None
-    wrong: str = ""
-
-
-_Item = _Reply | zenoh.Sample | _Token | _Question | Heartbeat | CacheAnswer | None
-"""Items of the receiving thread's queue; None wakes a receiver when the bus closes."""
 
 
 class ZenohBus:
@@ -97,7 +62,7 @@ class ZenohBus:
     ) -> None:
         self._prefix = f"team/{team}/"
         self._sheds = frozenset(channel.name for channel in sheds)
-        self._queue: SimpleQueue[_Item] = SimpleQueue()
+        self._queue: SimpleQueue[Work | None] = SimpleQueue()
         self._publishers: dict[str, Publisher] = {}
         self._counters: dict[str, int] = {}
         self._requested: set[tuple[str, str]] = set()
@@ -116,7 +81,7 @@ class ZenohBus:
         self._closed = threading.Event()
         self._keys = keys
         self._session = client(connect, patience_s, keys, stop)
-        self._recovery = Recovery(self._session, self._prefix, self._admit)
+        self._recovery = Recovery(self._session, self._prefix, self._admit, self._queue.put)
         self._link = RouterLink(self._session, connect, keys)
         # While the interpreter ends no thread of Zenoh may call it any more.
         atexit.register(self._end_session)
@@ -223,29 +188,31 @@ class ZenohBus:
             if channel.delivery != "stream" and channel.name not in self._sheds:
                 self._recovery.watch(key)
 
-    def _admit(self, item: _Item) -> None:
-        """Queue a received item, except samples on keys of no channel or of too many keys."""
-        if isinstance(item, zenoh.Sample | _Token):
-            sample = item.sample if isinstance(item, _Token) else item
-            key = str(sample.key_expr).removeprefix(self._prefix)
-            if key not in self._keys_received:
-                if row_of(key) is None:
-                    self._drop(key, "no channel has this key")
-                    return
-                if len(self._keys_received) >= MOST_KEYS:
-                    self._drop(key, f"samples of {MOST_KEYS} other keys came before")
-                    return
-                self._keys_received.add(key)
-        self._queue.put(item)
+    def _admit(self, sample: zenoh.Sample) -> None:
+        if self._is_admitted(sample):
+            self._queue.put(partial(self._take_sample, sample))
+
+    def _is_admitted(self, sample: zenoh.Sample) -> bool:
+        """Drop samples on keys of no channel or of too many keys."""
+        key = str(sample.key_expr).removeprefix(self._prefix)
+        if key not in self._keys_received:
+            if row_of(key) is None:
+                self._drop(key, "no channel has this key")
+                return False
+            if len(self._keys_received) >= MOST_KEYS:
+                self._drop(key, f"samples of {MOST_KEYS} other keys came before")
+                return False
+            self._keys_received.add(key)
+        return True
 
     def _drop(self, key: str, why: str) -> None:
         with self._counting:
             self.dropped += 1
         LOG.warning("%s: dropped, %s (%d so far)", cut(key, 80), why, self.dropped)
 
-    def _shed(self, item: _Item) -> None:
+    def _shed(self, sample: zenoh.Sample) -> None:
         if self._queue.qsize() < MOST_WAITING:
-            self._admit(item)
+            self._admit(sample)
 
     def receive(self, timeout_s: float = 0.0) -> list[Sample]:
         """Return the samples since the last call, and answer the queries on the caller's thread.
@@ -260,10 +227,10 @@ class ZenohBus:
         with suppress(Empty):
             while waiting is None or waiting > 0:
                 wait = 0.0 if samples else until - time.monotonic()
-                item = self._queue.get(timeout=wait) if wait > 0.0 else self._queue.get_nowait()
-                if item is None:
+                work = self._queue.get(timeout=wait) if wait > 0.0 else self._queue.get_nowait()
+                if work is None:  # the bus closes
                     break
-                self._take(item, samples)
+                samples += work()
                 if waiting is not None:
                     waiting -= 1
                 elif samples or time.monotonic() >= until:
@@ -273,40 +240,28 @@ class ZenohBus:
             self.tap(samples)
         return samples
 
-    def _take(self, item: _Item, samples: list[Sample]) -> None:
-        match item:
-            case _Question():
-                item.reply()
-            case _Token():
-                node = ALIVE.owner(str(item.sample.key_expr).removeprefix(self._prefix))
-                if node is not None and node not in self._tokens:
-                    alive = item.sample.kind == zenoh.SampleKind.PUT
-                    payload = encoded(Liveliness(stamp_ns=0, node=node, alive=alive))
-                    samples.append(Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0))
-            case Heartbeat():
-                self._recovery.take_heartbeat(item)
-            case CacheAnswer():
-                samples += self._recovery.take_answer(item)
-            case _Reply():
-                samples += self._read_reply(item)
-            case zenoh.Sample():
-                self._take_sample(item, samples)
+    def _take_token(self, token: zenoh.Sample) -> list[Sample]:
+        node = ALIVE.owner(str(token.key_expr).removeprefix(self._prefix))
+        if node is None or node in self._tokens:
+            return []
+        alive = token.kind == zenoh.SampleKind.PUT
+        payload = encoded(Liveliness(stamp_ns=0, node=node, alive=alive))
+        return [Sample(ALIVE.key(node), payload, 0, time.time_ns(), 0)]
 
-    def _take_sample(self, item: zenoh.Sample, samples: list[Sample]) -> None:
-        whole = str(item.key_expr)
+    def _take_sample(self, received: zenoh.Sample) -> list[Sample]:
+        whole, attached = str(received.key_expr), received.attachment
         try:
-            beside = unpack(whole, b"" if item.attachment is None else item.attachment.to_bytes())
+            beside = unpack(whole, b"" if attached is None else attached.to_bytes())
         except AttachmentError as error:  # counts as missing: recovered from its publisher's cache
             self._drop(whole, str(error))
-            return
+            return []
         key = whole.removeprefix(self._prefix)
-        sample = Sample(key, item.payload.to_bytes(), *beside)
+        sample = Sample(key, received.payload.to_bytes(), *beside)
         row = row_of(key)
         is_shed = row is not None and row.name in self._sheds
-        if item.source_info is None or is_shed:  # lost samples are not requested
-            samples.append(sample)
-        else:
-            samples += self._recovery.take_sample(sample, item.source_info)
+        if received.source_info is None or is_shed:  # lost samples are not requested
+            return [sample]
+        return self._recovery.take_sample(sample, received.source_info)
 
     def redeliver(self) -> None:
         self._recovery.redeliver()
@@ -321,7 +276,7 @@ class ZenohBus:
         self._check_open()
 
         def take(query: zenoh.Query) -> None:
-            self._queue.put(_Question(query, answer))
+            self._queue.put(partial(_reply_to, query, answer))
 
         self._session.declare_queryable(
             self._prefix + channel.key(name), Callback(take, indirect=False)
@@ -353,12 +308,13 @@ class ZenohBus:
 
         def take(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                self._queue.put(_Reply(channel, name, reply.ok.payload.to_bytes()))
+                payload = reply.ok.payload.to_bytes()
+                self._queue.put(partial(_read_reply, channel, name, payload))
             elif reply.err is not None:
-                self._queue.put(_Reply(channel, name, None, _reason(reply.err)))
+                self._queue.put(partial(self._end_query, channel, name, _reason(reply.err)))
 
         def end() -> None:
-            self._queue.put(_Reply(channel, name, None))
+            self._queue.put(partial(self._end_query, channel, name))
 
         self._session.get(
             self._prefix + channel.key(name),
@@ -368,18 +324,11 @@ class ZenohBus:
             **_EACH_REPLY,
         )
 
-    def _read_reply(self, reply: _Reply) -> list[Sample]:
-        key = reply.channel.key(reply.name)
-        if reply.payload is None:
-            self._open_queries.discard((reply.channel.name, reply.name))
-            if reply.wrong:
-                LOG.warning("%s: %s (waited at most %s s)", key, reply.wrong, _ANSWER_S)
-            return []
-        try:
-            return [read_reply(reply.channel, reply.name, reply.payload, time.time_ns())]
-        except WireError as error:
-            LOG.warning("%s: dropped a reply: %s", key, error)
-            return []
+    def _end_query(self, channel: Channel, name: str, wrong: str = "") -> list[Sample]:
+        self._open_queries.discard((channel.name, name))
+        if wrong:
+            LOG.warning("%s: %s (waited at most %s s)", channel.key(name), wrong, _ANSWER_S)
+        return []
 
     def declare_alive(self, node: str) -> None:
         self._check_open()
@@ -391,7 +340,8 @@ class ZenohBus:
         self._check_open()
 
         def notice(sample: zenoh.Sample) -> None:
-            self._admit(_Token(sample))
+            if self._is_admitted(sample):
+                self._queue.put(partial(self._take_token, sample))
 
         for selector in ALIVE.selectors(node):
             self._session.liveliness().declare_subscriber(
@@ -426,6 +376,26 @@ class ZenohBus:
                 f"it by `teamslam keys {self._keys.team} -o DIR --renew {self._keys.node}`, copy "
                 "it, and start this process again"
             )
+
+
+def _reply_to(query: zenoh.Query, answer: Answer) -> list[Sample]:
+    """Answer a query; the sender of an invalid request receives the error."""
+    request = b"" if query.payload is None else query.payload.to_bytes()
+    with query:
+        try:
+            for payload in answer(request):
+                query.reply(query.key_expr, payload)  # blocks as its query does
+        except ValueError as error:
+            query.reply_err(str(error))
+    return []
+
+
+def _read_reply(channel: Channel, name: str, payload: bytes) -> list[Sample]:
+    try:
+        return [read_reply(channel, name, payload, time.time_ns())]
+    except WireError as error:
+        LOG.warning("%s: dropped a reply: %s", channel.key(name), error)
+        return []
 
 
 def _reason(error: zenoh.ReplyError | None) -> str:

@@ -8,7 +8,7 @@ half a second are requested. A team of 100 robots, each restarted 30 times, is w
 import struct
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 
 import zenoh
 from zenoh.handlers import Callback
@@ -32,39 +32,23 @@ MOST_ASKED = 256  # most cache requests in one check
 _UNTRACKED = "%.80s: too many publishers there, what is missing is not requested (%d so far)"
 
 
-@dataclass(frozen=True)
-class Heartbeat:
-    """Number of a publisher's last publication on a key."""
-
-    key: str
-    publisher: str
-    newest: int
-
-
-@dataclass
-class CacheAnswer:
-    """Reply of a publisher's cache to a request, when its last number was `known`."""
-
-    key: str
-    publisher: str
-    first: int
-    repeated: bool
-    known: int
-    newest: int = -1
-    failed: bool = False
+Work = Callable[[], list[Sample]]
+"""Work of Zenoh's threads for the receiving one, which delivers the samples that it returns."""
 
 
 class Recovery:
-    """Recovery for one session. Zenoh's thread calls `put`, one thread all other methods."""
+    """Recovery for one session. Zenoh's threads call `admit` and `put`, one thread its methods."""
 
     def __init__(
         self,
         session: zenoh.Session,
         prefix: str,
-        put: Callable[[zenoh.Sample | Heartbeat | CacheAnswer], None],
+        admit: Callable[[zenoh.Sample], None],
+        put: Callable[[Work], None],
     ) -> None:
         self._session = session
         self._prefix = prefix
+        self._admit = admit
         self._put = put
         self._whole: set[str] = set()
         self._beats: dict[str, bytes] = {}
@@ -98,27 +82,26 @@ class Recovery:
             key, _, rest = name.removeprefix(self._prefix).partition(ADVANCED)
             publisher = "/".join(rest.split("/")[:2])
             if publisher:
-                self._put(Heartbeat(key, publisher, *_BEAT.unpack(beat)))
+                self._put(partial(self.take_heartbeat, key, publisher, *_BEAT.unpack(beat)))
 
-    def take_heartbeat(self, beat: Heartbeat) -> None:
+    def take_heartbeat(self, key: str, publisher: str, newest: int) -> list[Sample]:
         """Record a publisher's last number; no effect for a publisher of another key."""
-        if self._keys.get(beat.publisher, beat.key) not in (beat.key, _SEVERAL):
-            return
-        arrivals = self._arrivals_of(beat.key, beat.publisher, beat.newest)
-        if arrivals is not None:
-            arrivals.know(beat.newest)
-            self._incomplete.add((beat.key, beat.publisher))
+        if self._keys.get(publisher, key) in (key, _SEVERAL):
+            arrivals = self._arrivals_of(key, publisher, newest)
+            if arrivals is not None:
+                arrivals.know(newest)
+                self._incomplete.add((key, publisher))
+        return []
 
-    def take_answer(self, answer: CacheAnswer) -> list[Sample]:
-        """Record a cache's complete reply; return the samples to deliver now."""
-        if not answer.repeated or answer.failed or answer.newest < 0:
-            return []
-        arrivals = self._arrivals.get((answer.key, answer.publisher))
+    def _take_answer(
+        self, key: str, publisher: str, known: int, first: int, newest: int
+    ) -> list[Sample]:
+        arrivals = self._arrivals.get((key, publisher))
         if arrivals is None:  # forgotten since
             return []
-        if answer.newest < arrivals.newest:
+        if newest < arrivals.newest:
             self._beats.clear()  # the next heartbeats count as new
-        return arrivals.take_answer(answer.first, answer.newest, answer.known)
+        return arrivals.take_answer(first, newest, known)
 
     def take_sample(self, sample: Sample, source: zenoh.SourceInfo) -> list[Sample]:
         """Record a received publication; return the samples to deliver now, in order."""
@@ -172,22 +155,27 @@ class Recovery:
     def _ask_cache(
         self, key: str, publisher: str, known: int, first: int, last: int | None
     ) -> None:
-        answer = CacheAnswer(key, publisher, first, repeated=last is None, known=known)
+        newest, failed = -1, False
 
         def take(reply: zenoh.Reply) -> None:
+            nonlocal newest, failed
             if reply.ok is None:
-                answer.failed = True
+                failed = True
             elif reply.ok.source_info is not None:
                 author, number = _read_source(reply.ok.source_info)
                 if author == publisher:
-                    answer.newest = max(answer.newest, number)
-                self._put(reply.ok)
+                    newest = max(newest, number)
+                self._admit(reply.ok)
+
+        def end() -> None:
+            if last is None and newest >= 0 and not failed:
+                self._put(partial(self._take_answer, key, publisher, known, first, newest))
 
         until = "" if last is None else str(last)
         LOG.info("%.80s: %d to %s are missing, asked for", key, first, until or "the newest")
         self._session.get(
             f"{self._prefix}{key}{ADVANCED}{publisher}/**?_anyke;_sn={first}..{until}",
-            Callback(take, drop=lambda: self._put(answer), indirect=False),
+            Callback(take, drop=end, indirect=False),
             timeout=_ANSWER_S,
             consolidation=zenoh.ConsolidationMode.NONE,
             target=zenoh.QueryTarget.ALL,
