@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 
 from teamslam.central.desk.evaluation.results import MapResult
-from teamslam.sim.recorded.chains import Chain
+from teamslam.sim.recorded.chains import Chain, Scan
+from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import Matrix
-from teamslam.team.estimation.models import located, predicted
+from teamslam.team.estimation.models import Increment, located, predicted
 from teamslam.team.estimation.se2 import Point, Pose, tangent
 from teamslam.team.extras import install_command
 from teamslam.team.registry import NotInstalledError
@@ -84,26 +85,50 @@ def factor_graph(
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
         first = pose_key(c, 0)
         for i, scan in enumerate(chain.scans, 1):
-            seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
-            for k, (landmark, r, b) in enumerate(seen):
-                distance, _ = predicted(path[i], landmarks[landmark])
-                R = scan.noise(k, chain.config.sensor, distance)[::-1, ::-1]
-                model = (
-                    gtsam.noiseModel.Gaussian.Covariance(R)
-                    if scan.own.size
-                    else gtsam.noiseModel.Diagonal.Variances(np.diag(R))
-                )
-                model = under_loss(gtsam, model, robust_c)
-                graph.push_back(
-                    gtsam.BearingRangeFactor2D(first + i, landmark, gtsam.Rot2(b), r, model)
-                )
+            seen = scan, chain.config.sensor, path[i]
+            add_scan(gtsam, graph, first + i, *seen, landmarks, robust_c)
     return graph
+
+
+def add_scan(
+    gtsam: Any,
+    graph: Any,
+    key: int,
+    scan: Scan,
+    sensor: Sensor,
+    pose: Pose,
+    landmarks: Mapping[int, Point],
+    robust_c: float | None,
+) -> None:
+    """Add the factors of measurements from a pose, with noise at the predicted ranges."""
+    seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
+    for k, (landmark, r, b) in enumerate(seen):
+        distance, _ = predicted(pose, landmarks[landmark])
+        R = scan.noise(k, sensor, distance)[::-1, ::-1]
+        model = under_loss(gtsam, gtsam.noiseModel.Gaussian.Covariance(R), robust_c)
+        graph.push_back(gtsam.BearingRangeFactor2D(key, landmark, gtsam.Rot2(b), r, model))
+
+
+def add_motion(gtsam: Any, graph: Any, before: int, after: int, increment: Increment) -> None:
+    """Add the factor of the motion between two poses."""
+    floor = np.diag(FLOOR_SIGMAS) ** 2
+    model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
+    graph.push_back(gtsam.BetweenFactorPose2(before, after, gtsam.Pose2(*increment.mean), model))
+
+
+def joint_covariance(marginals: Any, landmarks: Sequence[int]) -> Matrix:
+    """Joint covariance of at least one landmark."""
+    if len(landmarks) == 1:
+        covariance = np.asarray(marginals.marginalCovariance(landmarks[0]))
+    else:
+        joint = marginals.jointMarginalCovariance(landmarks)
+        covariance = np.block([[joint.at(i, k) for k in landmarks] for i in landmarks])
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> Any:
     """Make the factors of initial poses and odometry."""
     graph = gtsam.NonlinearFactorGraph()
-    floor = np.diag(FLOOR_SIGMAS) ** 2
     anyone = any(chain.start is not None for chain in chains)
     for c, (chain, path) in enumerate(zip(chains, poses, strict=True)):
         first = pose_key(c, 0)
@@ -111,9 +136,7 @@ def path_graph(gtsam: Any, chains: Sequence[Chain], poses: Sequence[Poses]) -> A
         if start is not None:
             graph.push_back(start_factor(gtsam, first, start, chain.start_covariance))
         for i, increment in enumerate(chain.increments):
-            model = gtsam.noiseModel.Gaussian.Covariance(increment.covariance + floor)
-            motion = gtsam.Pose2(*increment.mean)
-            graph.push_back(gtsam.BetweenFactorPose2(first + i, first + i + 1, motion, model))
+            add_motion(gtsam, graph, first + i, first + i + 1, increment)
     return graph
 
 

@@ -14,17 +14,18 @@ import numpy as np
 
 from teamslam.sim.recorded.chains import Scan
 from teamslam.sim.studies.batch_reference.graph import (
-    FLOOR_SIGMAS,
+    add_motion,
+    add_scan,
+    joint_covariance,
     load_gtsam,
     newton_step,
     optimizer_of,
     start_factor,
-    under_loss,
 )
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from teamslam.team.estimation.models import located, predicted
+from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import Pose, compose, tangent
 from teamslam.team.library import BatchMap, InitialPose, Keyframe, LandmarkMap, Trajectory
 from teamslam.team.shapes import Float, UInt32
@@ -107,26 +108,16 @@ class GrowingBatch:
         """Make the factors at the present estimate."""
         gtsam = load_gtsam()
         graph = gtsam.NonlinearFactorGraph()
-        floor = np.diag(FLOOR_SIGMAS) ** 2
         for k, (start, covariance) in enumerate(self.starts.values()):
             graph.push_back(start_factor(gtsam, _POSES + k, start, covariance))
         newest = {robot: k for k, robot in enumerate(self.starts)}
         for place, step in enumerate(self.steps, len(self.starts)):
-            motion = gtsam.noiseModel.Gaussian.Covariance(step.increment.covariance + floor)
             before, newest[step.robot] = newest[step.robot], place
-            between = gtsam.Pose2(*step.increment.mean)
-            graph.push_back(
-                gtsam.BetweenFactorPose2(_POSES + before, _POSES + place, between, motion)
-            )
+            key = _POSES + place
+            add_motion(gtsam, graph, _POSES + before, key, step.increment)
             scan = Scan(step.ids, step.ranges, step.bearings, step.own)
-            seen = zip(scan.ids.tolist(), scan.ranges, scan.bearings, strict=True)
-            for k, (landmark, r, b) in enumerate(seen):
-                distance, _ = predicted(self.poses[place], self.landmarks[landmark])
-                R = scan.noise(k, step.sensor, distance)[::-1, ::-1]
-                model = under_loss(gtsam, gtsam.noiseModel.Gaussian.Covariance(R), robust_c)
-                graph.push_back(
-                    gtsam.BearingRangeFactor2D(_POSES + place, landmark, gtsam.Rot2(b), r, model)
-                )
+            seen = scan, step.sensor, self.poses[place]
+            add_scan(gtsam, graph, key, *seen, self.landmarks, robust_c)
         return graph
 
     @cached_property
@@ -213,16 +204,8 @@ def landmark_gaussian(batch: GrowingBatch) -> LandmarkGaussian:
     """Mean and joint covariance of all landmarks."""
     ids = batch.ids
     means = np.array([batch.landmarks[id_] for id_ in ids.tolist()]).reshape(-1, 2)
-    n = len(ids)
-    covariance = np.empty((2 * n, 2 * n))
-    if n == 1:
-        covariance[:] = batch.marginals.marginalCovariance(int(ids[0]))
-    elif n:
-        joint = batch.marginals.jointMarginalCovariance([int(id_) for id_ in ids])
-        for i, a in enumerate(ids.tolist()):
-            for j, b in enumerate(ids.tolist()):
-                covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = joint.at(a, b)
-    return LandmarkGaussian(ids, means, 0.5 * (covariance + covariance.T))
+    joint = joint_covariance(batch.marginals, ids.tolist()) if len(ids) else np.empty((0, 0))
+    return LandmarkGaussian(ids, means, joint)
 
 
 def pose_gaussian(batch: GrowingBatch, robot: str) -> PoseGaussian:

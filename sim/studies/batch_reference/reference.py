@@ -36,6 +36,7 @@ from teamslam.sim.studies.batch_reference.errors import (
 )
 from teamslam.sim.studies.batch_reference.graph import (
     factor_graph,
+    joint_covariance,
     landmark_starts,
     load_gtsam,
     newton_step,
@@ -250,9 +251,7 @@ def _reference_figures(
     marginals = gtsam.Marginals(graph, optimum)
     ids = np.array(landmarks, dtype=np.uint32)
     means = np.array([optimum.atPoint2(i) for i in landmarks])
-    joint = marginals.jointMarginalCovariance(landmarks)
-    covariance = np.block([[joint.at(i, k) for k in landmarks] for i in landmarks])
-    covariance = 0.5 * (covariance + covariance.T)
+    covariance = joint_covariance(marginals, landmarks)
     truth = dict(
         zip(run.map.ids[run.map.known].tolist(), run.map.truth[run.map.known], strict=True)
     )
