@@ -46,9 +46,7 @@ APART = 2**40
 """Offset of the single robot's landmark numbers, above all others."""
 
 
-class Disagreement(NamedTuple):
-    """D of one robot, and its degrees of freedom."""
-
+class _Disagreement(NamedTuple):
     chi2: float
     dof: int
 
@@ -72,7 +70,7 @@ def central_figures(
         return tuple(strays)
     found = (*strays, factor)
     central = msgspec.structs.replace(central, covariance_factor=factor.value)
-    further = [normal_scale(folds, central)]
+    further = [_normal_scale(folds, central)]
     if true_landmarks:
         further.append(landmark_sigma(list(zip(folds, true_landmarks, strict=True)), central))
     return (*found, *(figure for figure in further if figure is not None))
@@ -159,7 +157,7 @@ def _shape_chi2(
     return 0.0 if shape is None else 0.5 * (2 * len(means) - 3) * shape.nees_per_landmark
 
 
-def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
+def _normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
     """Covariance scale of consistent data: geometric mean over the worlds.
 
     Standard deviation from their scatter, or the monitor's for one.
@@ -180,10 +178,10 @@ def normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None
         return None
     value = float(np.exp(np.mean(scales)))
     spread = float(np.std(scales, ddof=1)) if len(scales) > 1 else float(sigmas[0])
-    return Figure("normal_scale", value, value * spread / np.sqrt(len(scales)), "")
+    return Figure("_normal_scale", value, value * spread / np.sqrt(len(scales)), "")
 
 
-def disagreements(fold: Fold, settings: JoinSettings) -> list[Disagreement]:
+def disagreements(fold: Fold, settings: JoinSettings) -> list[_Disagreement]:
     """D of each robot with at least LEAST_LANDMARKS in common with the others."""
     island = fold.main
     robots = sorted({robot for robot, _ in island.graph.streams})
@@ -233,12 +231,12 @@ def _separate_robot(
 
 def _compare_maps(
     mean: Float[np.ndarray, " m"], covariance: Float[np.ndarray, "m m"]
-) -> Disagreement:
+) -> _Disagreement:
     """D, from stacked means and joint covariance."""
     a, b = mean.reshape(2, -1, 2)
     a_from_b = rigid_alignment(a, b)
     if a_from_b is None:
-        return Disagreement(0.0, 0)
+        return _Disagreement(0.0, 0)
     c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
     turn = np.kron(np.eye(len(a)), np.array([[c, -s], [s, c]]))
     difference = np.hstack([np.eye(2 * len(a)), -turn])
@@ -246,4 +244,4 @@ def _compare_maps(
     shape = map_errors(a, of_difference, transform_points(a_from_b, b)).shape
     dof = 2 * len(a) - 3
     assert shape is not None
-    return Disagreement(0.5 * dof * shape.nees_per_landmark, dof)
+    return _Disagreement(0.5 * dof * shape.nees_per_landmark, dof)

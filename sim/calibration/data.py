@@ -72,7 +72,7 @@ def sensor_poses(
     return poses + moved_on, known
 
 
-class SeenLandmarks(NamedTuple):
+class _SeenLandmarks(NamedTuple):
     """Detections of known landmarks from known poses; chosen: mask of all."""
 
     chosen: Bool[np.ndarray, " N"]
@@ -81,7 +81,7 @@ class SeenLandmarks(NamedTuple):
     landmarks: Float[np.ndarray, "n 2"]
 
 
-def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None) -> SeenLandmarks:
+def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None) -> _SeenLandmarks:
     """Known landmarks among the detections."""
     seen = data.seen
     stamps = np.repeat(seen.stamps_ns, np.diff(seen.offsets))
@@ -89,11 +89,10 @@ def seen_landmarks(data: Reference, usable: Bool[np.ndarray, " N"] | None = None
     chosen &= np.isin(seen.ids, np.array(sorted(data.landmarks), dtype=np.int64))
     chosen &= True if usable is None else usable
     landmarks = np.array([data.landmarks[i] for i in seen.ids[chosen].tolist()]).reshape(-1, 2)
-    return SeenLandmarks(chosen, stamps[chosen], poses[chosen], landmarks)
+    return _SeenLandmarks(chosen, stamps[chosen], poses[chosen], landmarks)
 
 
-def as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
-    """Convert odometry to mean speeds, increments as arcs."""
+def _as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
     speeds = np.column_stack([intervals.forward, intervals.yaw_rate])
     if intervals.steered:
         speeds = np.array([steered(motion, *pair) for pair in speeds.tolist()]).reshape(-1, 2)
@@ -162,7 +161,7 @@ def references(
     return [
         Reference(
             name=f"{label} {stream.robot}",
-            intervals=as_speeds(stream.intervals, robot.motion),
+            intervals=_as_speeds(stream.intervals, robot.motion),
             seen=stream.landmark_detections,
             path=paths[stream.robot],
             gap_ns=gap_ns,

@@ -49,7 +49,7 @@ UNITS = {
 }
 
 
-class WindowLooks(NamedTuple):
+class _WindowLooks(NamedTuple):
     """Repeated detections in a window.
 
     trials, again: per landmark, scans that cover its place after its first detection, and
@@ -65,7 +65,7 @@ class WindowLooks(NamedTuple):
     dof: int
 
 
-def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
+def windows_of(stream: RobotStream, config: RobotConfig) -> list[_WindowLooks]:
     """Solvable windows with detections without identities."""
     if stream.landmark_detections.hidden is None:
         return []
@@ -95,15 +95,14 @@ def windows_of(stream: RobotStream, config: RobotConfig) -> list[WindowLooks]:
     return found
 
 
-def _looks(scans: Scans, settings: AssociationSettings) -> list[WindowLooks]:
+def _looks(scans: Scans, settings: AssociationSettings) -> list[_WindowLooks]:
     try:
-        return [looks_of(cluster_window(scans, settings))]
+        return [_looks_of(cluster_window(scans, settings))]
     except np.linalg.LinAlgError:
         return []
 
 
-def looks_of(found: Clusters) -> WindowLooks:
-    """Trials and detections of each landmark."""
+def _looks_of(found: Clusters) -> _WindowLooks:
     scans, landmarks = found.scans, found.window.landmarks
     unnamed = found.names == UNASSIGNED
     trials = np.zeros(len(landmarks), np.int64)
@@ -133,7 +132,7 @@ def looks_of(found: Clusters) -> WindowLooks:
         again += in_view & detected
         known |= detected
     view = estimate_view(scans)
-    return WindowLooks(
+    return _WindowLooks(
         trials=trials[unnamed],
         again=again[unnamed],
         further=(counts - 1 - again)[unnamed],
@@ -155,7 +154,7 @@ class Rates(NamedTuple):
     claimed: float
 
 
-def rates(windows: Sequence[WindowLooks]) -> Rates | None:
+def rates(windows: Sequence[_WindowLooks]) -> Rates | None:
     """Maximum-likelihood rates; None below LEAST_TRIALS."""
     n, v, more = (
         np.concatenate([np.zeros(0, np.int64), *(getattr(each, name) for each in windows)])
@@ -197,14 +196,14 @@ def _clutter(
     return probability
 
 
-def detection_figures(windows: Sequence[WindowLooks]) -> tuple[Figure, ...]:
+def detection_figures(windows: Sequence[_WindowLooks]) -> tuple[Figure, ...]:
     """Rates of all windows, with jackknife uncertainty."""
     if len(windows) < GROUPS:
         return ()
     edges = np.linspace(0, len(windows), GROUPS + 1).astype(int)
     groups = [windows[a:b] for a, b in pairwise(edges)]
 
-    def fit(part: Sequence[WindowLooks]) -> dict[str, float]:
+    def fit(part: Sequence[_WindowLooks]) -> dict[str, float]:
         found = rates(part)
         return {} if found is None else dict(zip(UNITS, found, strict=True))
 

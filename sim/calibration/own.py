@@ -32,7 +32,7 @@ BIAS_OF = {
 """Bias that the centre estimates for each constant."""
 
 
-class Own(NamedTuple):
+class _Own(NamedTuple):
     """robots: sensor figures of each, empty if alike. strays: σ of each bias in a further world,
     √(s² + variance of the figure).
     """
@@ -41,10 +41,10 @@ class Own(NamedTuple):
     strays: tuple[Figure, ...]
 
 
-NOTHING_OF_ITS_OWN = Own({}, ())
+NOTHING_OF_ITS_OWN = _Own({}, ())
 
 
-def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
+def own_constants(data: Sequence[Reference], *, depth: bool) -> _Own:
     """Each robot's constants over worlds, or time stretches."""
     found: dict[str, list[Mapping[str, float]]] = {}
     covariances = []
@@ -90,7 +90,7 @@ def own_constants(data: Sequence[Reference], *, depth: bool) -> Own:
     numbers = len(spreads) * dof[0]
     if T2 / numbers <= float(f_distribution.ppf(BEYOND_DOUBT, numbers, dof[1])):
         return NOTHING_OF_ITS_OWN
-    return Own({robot: tuple(each) for robot, each in robots.items()}, tuple(strays))
+    return _Own({robot: tuple(each) for robot, each in robots.items()}, tuple(strays))
 
 
 def _spread_in_robot(parts: Sequence[Float[np.ndarray, " n"]]) -> float:

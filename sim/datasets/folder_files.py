@@ -23,14 +23,14 @@ EXPECTED = (
 )
 
 
-class NoTablesError(DatasetError):
+class _NoTablesError(DatasetError):
     """No robot's table."""
 
 
 @contextmanager
 def open_folder(path: str) -> Iterator[tuple[File, Mapping[str, File]]]:
     """Open the folder, and each robot's by name; raises DatasetError."""
-    with open_place(path, EXPECTED, NoTablesError) as root:
+    with open_place(path, EXPECTED, _NoTablesError) as root:
         inner = root if isinstance(root, Path) else _root(root)
         yield inner, _robots_in(inner, path)
 
@@ -57,7 +57,7 @@ def has_tables(path: str | Path) -> bool:
         with open_folder(str(path)):
             return True
     except DatasetError as error:
-        if isinstance(error, NoTablesError):
+        if isinstance(error, _NoTablesError):
             return False
         raise
     except OSError:
@@ -89,7 +89,7 @@ def _robots_in(root: File, path: str) -> Mapping[str, File]:
         if entry.is_dir() and any((entry / each).is_file() for each in STREAM_FILES)
     }
     if not found:
-        raise NoTablesError(f"{path}: no robot in it; {EXPECTED}")
+        raise _NoTablesError(f"{path}: no robot in it; {EXPECTED}")
     for name in found:
         if not re.fullmatch(ROBOT_NAME, name):
             raise DatasetError(

@@ -75,7 +75,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
     duration = np.diff(stamps)
     used = slice(None)
     if form == POSES:
-        steps, ends, used = motions_between(numbers), stamps[1:], slice(1, None)
+        steps, ends, used = _motions_between(numbers), stamps[1:], slice(1, None)
         steps = _omit_resets(rows, numbers, steps, duration)
     elif form in (SPEEDS, STEERED) and not table.has("duration_s"):
         steps, ends, used = numbers[:-1], stamps[1:], slice(0, -1)
@@ -92,7 +92,7 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
         motions = numbers_in(rows.table, INCREMENTS, forms)[used]
         if form == SPEEDS and claims is not None:
             arced = ~np.isnan(claims[:, 0, 0]) & np.isnan(motions[:, 0])
-            motions[arced] = arcs(steps[arced], duration[arced])
+            motions[arced] = _arcs(steps[arced], duration[arced])
         as_motions = ~np.isnan(motions[:, 0])
         forward[as_motions], yaw_rate[as_motions] = 0.0, 0.0
         increments = motions if as_motions.any() else None
@@ -298,7 +298,7 @@ def _first_duration(rows: Rows, others: Int64[np.ndarray, " k"]) -> Int64[np.nda
     return others[:1] if len(others) else np.array([10**9])
 
 
-def arcs(
+def _arcs(
     speeds: Float[np.ndarray, "N 2"], duration_ns: Int64[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
     """Chord (forward, left, turn) of the arc at constant speed and yaw rate."""
@@ -307,8 +307,7 @@ def arcs(
     return np.column_stack([chord * np.cos(0.5 * turn), chord * np.sin(0.5 * turn), turn])
 
 
-def motions_between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
-    """Each pose in the frame of the previous one."""
+def _motions_between(poses: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
     dx, dy, turn = np.diff(poses, axis=0).T if len(poses) > 1 else np.zeros((3, 0))
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, on_circle(turn)])

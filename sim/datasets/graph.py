@@ -44,7 +44,7 @@ EXPECTED = "expected a landmark graph of isam, g2o or pyfg"
 
 def is_graph(path: str | Path) -> bool:
     """Whether a file is a graph, by its first keyword."""
-    return Path(path).is_file() and first_line(Path(path)) is not None
+    return Path(path).is_file() and _first_line(Path(path)) is not None
 
 
 def robot_count(path: str) -> int:
@@ -80,10 +80,10 @@ def graph_world(world: GraphWorld, robots: int) -> WorldStreams:
 
 
 def _read(path: str) -> FactorGraph:
-    first = first_line(Path(path)) if Path(path).is_file() else None
+    first = _first_line(Path(path)) if Path(path).is_file() else None
     if first is None:
         raise DatasetError(f"{path}: no such file, or not a graph; {EXPECTED}")
-    return read_pyfg(Path(path)) if is_pyfg(first) else read_graph(Path(path))
+    return read_pyfg(Path(path)) if _is_pyfg(first) else read_graph(Path(path))
 
 
 POSES = ("VERTEX_SE2", "VERTEX2")
@@ -92,23 +92,21 @@ POINT_EDGES = ("EDGE_SE2_XY", "LANDMARK")
 SPATIAL = ("EDGE3", "VERTEX3", "EDGE_SE3:QUAT", "VERTEX_SE3:QUAT", "EDGE_SE3_XYZ", "VERTEX_XYZ")
 
 
-class Form(NamedTuple):
-    """Words before a line's numbers, counts of numbers, their meaning."""
-
+class _Form(NamedTuple):
     names: int
     counts: tuple[int, ...]
     words: str
 
 
 GRAPH_FORMS = {
-    **dict.fromkeys(POSES, Form(1, (3,), "pose x y theta")),
-    "VERTEX_XY": Form(1, (2,), "landmark x y"),
-    "FIX": Form(1, (0,), "pose"),
+    **dict.fromkeys(POSES, _Form(1, (3,), "pose x y theta")),
+    "VERTEX_XY": _Form(1, (2,), "landmark x y"),
+    "FIX": _Form(1, (0,), "pose"),
     **dict.fromkeys(
-        POSE_EDGES, Form(2, (9, 3), "pose pose x y theta and six numbers of the information")
+        POSE_EDGES, _Form(2, (9, 3), "pose pose x y theta and six numbers of the information")
     ),
     **dict.fromkeys(
-        POINT_EDGES, Form(2, (5, 2), "pose landmark x y and three numbers of the information")
+        POINT_EDGES, _Form(2, (5, 2), "pose landmark x y and three numbers of the information")
     ),
 }
 TRUTH = "_groundtruth"
@@ -117,9 +115,7 @@ HEAD = 65_536
 """Bytes in which a graph's first keyword is."""
 
 
-class Line(NamedTuple):
-    """Keyword and words of a line, with its place."""
-
+class _Line(NamedTuple):
     name: str
     number: int
     keyword: str
@@ -148,20 +144,19 @@ class Line(NamedTuple):
         return found
 
 
-def lines_of(path: Path) -> Iterator[Line]:
-    """Lines with a keyword; `#` begins a comment."""
+def _lines_of(path: Path) -> Iterator[_Line]:
     text = path.read_bytes().decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         words = line.partition("#")[0].split()
         if words:
-            yield Line(path.name, number, words[0], words[1:])
+            yield _Line(path.name, number, words[0], words[1:])
 
 
-def read_lines(
-    path: Path, forms: Mapping[str, Form], graph: FactorGraph
-) -> Iterator[tuple[Line, Float[np.ndarray, " n"]]]:
+def _read_lines(
+    path: Path, forms: Mapping[str, _Form], graph: FactorGraph
+) -> Iterator[tuple[_Line, Float[np.ndarray, " n"]]]:
     """Lines with their numbers; other keywords are counted in the graph; raises DatasetError."""
-    for line in lines_of(path):
+    for line in _lines_of(path):
         if line.keyword in SPATIAL:
             raise line.error("a graph in three dimensions; planar ones are read")
         form = forms.get(line.keyword)
@@ -178,7 +173,7 @@ def read_lines(
         yield line, line.values(form.names)
 
 
-def first_line(path: Path) -> Line | None:
+def _first_line(path: Path) -> _Line | None:
     """First line of a graph; None for other files."""
     known = {*GRAPH_FORMS, *SPATIAL, "VERTEX_SE2:PRIOR", "EDGE_RANGE"}
     with path.open("rb") as file:
@@ -186,7 +181,7 @@ def first_line(path: Path) -> Line | None:
     for number, line in enumerate(head.splitlines(), 1):
         words = line.partition("#")[0].split()
         if words and words[0] in known:
-            return Line(path.name, number, words[0], words[1:])
+            return _Line(path.name, number, words[0], words[1:])
         if words and not words[0].replace("_", "").replace(":", "").isupper():
             return None
     return None
@@ -205,7 +200,7 @@ def read_graph(path: Path) -> FactorGraph:
 
 def _read_numbered(path: Path) -> FactorGraph:
     graph = FactorGraph(path.stem)
-    found = list(read_lines(path, GRAPH_FORMS, graph))
+    found = list(_read_lines(path, GRAPH_FORMS, graph))
     fixed: list[Key] = []
     is_toro = any(line.keyword == "VERTEX2" for line, _ in found)
     for line, values in found:
@@ -230,7 +225,7 @@ def _read_numbered(path: Path) -> FactorGraph:
 
 
 def _covariance(
-    line: Line, weights: Float[np.ndarray, " w"], size: int, *, is_toro: bool
+    line: _Line, weights: Float[np.ndarray, " w"], size: int, *, is_toro: bool
 ) -> Matrix:
     """Invert the stated information; isam states its square root."""
     if not len(weights):
@@ -243,7 +238,7 @@ def _covariance(
 
 
 def _definite(
-    line: Line, weights: Float[np.ndarray, " w"], size: int, thing: str, *, is_root: bool = False
+    line: _Line, weights: Float[np.ndarray, " w"], size: int, thing: str, *, is_root: bool = False
 ) -> Matrix:
     """Matrix of an upper triangle, or SᵀS of its root S; raises DatasetError."""
     upper = np.zeros((size, size))
@@ -255,34 +250,33 @@ def _definite(
 
 
 PYFG_FORMS = {
-    "VERTEX_SE2": Form(2, (3,), "time pose x y theta"),
-    "VERTEX_XY": Form(1, (2,), "landmark x y"),
-    "VERTEX_SE2:PRIOR": Form(2, (9,), "time pose x y theta and six numbers of the covariance"),
-    "EDGE_SE2": Form(3, (9,), "time pose pose x y theta and six numbers of the covariance"),
-    "EDGE_SE2_XY": Form(3, (5,), "time pose landmark x y and three numbers of the covariance"),
+    "VERTEX_SE2": _Form(2, (3,), "time pose x y theta"),
+    "VERTEX_XY": _Form(1, (2,), "landmark x y"),
+    "VERTEX_SE2:PRIOR": _Form(2, (9,), "time pose x y theta and six numbers of the covariance"),
+    "EDGE_SE2": _Form(3, (9,), "time pose pose x y theta and six numbers of the covariance"),
+    "EDGE_SE2_XY": _Form(3, (5,), "time pose landmark x y and three numbers of the covariance"),
 }
 SYMBOL = re.compile("([A-Za-z]+)([0-9]{1,10})")
 
 
-def is_pyfg(line: Line) -> bool:
-    """Whether a line has named vertices."""
+def _is_pyfg(line: _Line) -> bool:
     return any(SYMBOL.fullmatch(word) for word in line.words[:3])
 
 
 def read_pyfg(path: Path) -> FactorGraph:
     """Read a file; raises DatasetError."""
     graph = FactorGraph(path.stem, are_true=True)
-    for line, values in read_lines(path, PYFG_FORMS, graph):
+    for line, values in _read_lines(path, PYFG_FORMS, graph):
         _take(line, values, graph)
     return graph
 
 
-def _take(line: Line, values: Float[np.ndarray, " n"], graph: FactorGraph) -> None:
+def _take(line: _Line, values: Float[np.ndarray, " n"], graph: FactorGraph) -> None:
     match line.keyword:
         case "VERTEX_SE2":
             key = _key(line, 1)
             graph.poses[key] = values
-            time = Line(line.name, line.number, line.keyword, line.words[:1]).values(0)[0]
+            time = _Line(line.name, line.number, line.keyword, line.words[:1]).values(0)[0]
             graph.stamps_ns[key] = round(float(time) * 1e9)
         case "VERTEX_XY":
             graph.landmarks[_key(line, 0)[1]] = values
@@ -300,7 +294,7 @@ def _take(line: Line, values: Float[np.ndarray, " n"], graph: FactorGraph) -> No
             )
 
 
-def _key(line: Line, k: int) -> Key:
+def _key(line: _Line, k: int) -> Key:
     found = SYMBOL.fullmatch(line.words[k])
     if found is None or int(found[2]) >= UNNAMED:
         raise line.error(

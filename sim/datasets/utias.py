@@ -29,7 +29,7 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 
 @dataclass(frozen=True)
-class Erratum:
+class _Erratum:
     """Measurements of subject k are of subjects[k]."""
 
     name: str
@@ -43,8 +43,8 @@ def content_digest(barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarr
     return hashlib.sha256(numbers).hexdigest()
 
 
-ERRATA: Mapping[str, Erratum] = {
-    "60e044e708a8e77ea50d4ce724a4f85fa8ccd99276ed30acee64e58df8c0d5e4": Erratum(
+ERRATA: Mapping[str, _Erratum] = {
+    "60e044e708a8e77ea50d4ce724a4f85fa8ccd99276ed30acee64e58df8c0d5e4": _Erratum(
         name="UTIAS set 1, landmarks 11 and 17",
         subjects={11: 17, 17: 11},
         note=(
@@ -56,10 +56,9 @@ ERRATA: Mapping[str, Erratum] = {
 }
 
 
-def erratum_of(
+def _erratum_of(
     barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarray, "L 5"]
-) -> Erratum | None:
-    """Known erratum of the data set."""
+) -> _Erratum | None:
     return ERRATA.get(content_digest(barcodes, landmarks))
 
 
@@ -98,7 +97,7 @@ def _streams(
     survey = optional_table(files, "Landmark_Groundtruth.dat", SURVEY)
     subject_of = _subjects(barcodes)
     notes = []
-    erratum = erratum_of(barcodes, survey) if world.errata else None
+    erratum = _erratum_of(barcodes, survey) if world.errata else None
     if erratum:
         notes.append(erratum.note)
         swap = erratum.subjects
@@ -177,9 +176,9 @@ def _stream(robot: str, read: _Reading) -> RobotStream:
             ("Odometry", ODOMETRY), ("Measurement", MEASUREMENT), ("Groundtruth", TRUTH),
         )
     )  # fmt: skip
-    intervals, odometry_notes = intervals_of(odometry, read.delay_ns + read.clocks[robot])
-    seen, measurement_notes = measurements_of(measured, read.subject_of)
-    truth_ns, truth, truth_notes = truth_of(true_rows)
+    intervals, odometry_notes = _intervals_of(odometry, read.delay_ns + read.clocks[robot])
+    seen, measurement_notes = _measurements_of(measured, read.subject_of)
+    truth_ns, truth, truth_notes = _truth_of(true_rows)
     missing = (
         "no odometry: only its observations are used" if not len(intervals.end_ns) else "",
         "no measurements: only its odometry is given" if not len(seen.stamps_ns) else "",
@@ -206,7 +205,7 @@ def _stream(robot: str, read: _Reading) -> RobotStream:
     seen = keep(of_team, "of a robot that is not in the team")
     teammates = seen.where(seen.ids <= read.last_robot)
     index = (teammates.ids[:, np.newaxis] == numbers).argmax(axis=1).astype(np.uint32)
-    start = start_pose(truth_ns, truth, start_ns)
+    start = _start_pose(truth_ns, truth, start_ns)
     if start is None:
         notes.append("no ground truth at its first measurement: its start pose is not known")
     ends = intervals.end_ns[-1:]
@@ -252,7 +251,7 @@ def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
     return np.rint(seconds * 1e6).astype(np.int64) * 1000
 
 
-def intervals_of(
+def _intervals_of(
     rows: Float[np.ndarray, "N 3"], delay_ns: int
 ) -> tuple[Intervals, tuple[str, ...]]:
     """Convert odometry rows (t, v, ω): row k acts over [t_k, t_{k+1}] + delay."""
@@ -280,10 +279,9 @@ def intervals_of(
     return intervals, tuple(filter(None, notes))
 
 
-def measurements_of(
+def _measurements_of(
     rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
 ) -> tuple[Scans, tuple[str, ...]]:
-    """Convert rows (t, barcode, range, bearing) to measurements by subject."""
     rows, backward = _sort_by_time(rows)
     codes = np.array(sorted(subject_of), dtype=np.float64)
     subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
@@ -310,7 +308,7 @@ def measurements_of(
     return measurements.where(single), tuple(filter(None, notes))
 
 
-def truth_of(
+def _truth_of(
     rows: Float[np.ndarray, "N 4"],
 ) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], tuple[str, ...]]:
     """Rows (t, x, y, θ) by time."""
@@ -325,7 +323,7 @@ def truth_of(
     return stamps, rows[:, 1:].copy(), tuple(filter(None, notes))
 
 
-def start_pose(
+def _start_pose(
     truth_ns: Int64[np.ndarray, " T"], truth: Float[np.ndarray, "T 3"], start_ns: int
 ) -> Float[np.ndarray, "3"] | None:
     """True pose at start_ns, interpolated on the circle, or None.

@@ -40,7 +40,7 @@ SAMPLED_MESSAGES = 2000
 """Number of /tf messages searched for tags."""
 
 
-class UndecidedError(DatasetError):
+class _UndecidedError(DatasetError):
     """Ambiguous topics; the text has a remedy."""
 
 
@@ -62,15 +62,14 @@ def propose_assignment(path: Path) -> str:
     """Proposed assignment file; raises BagError."""
     with opened_bag(path) as bag:
         found = _proposed(bag, None)
-        topics = [*listing(bag.topics).splitlines(), *found.warnings]
-        return "".join(f"# {line.strip()}\n" for line in topics) + as_toml(found)
+        topics = [*_listing(bag.topics).splitlines(), *found.warnings]
+        return "".join(f"# {line.strip()}\n" for line in topics) + _as_toml(found)
 
 
-def decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
-    """Topics by names and types; raises UndecidedError."""
+def _decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
     found = _proposed(bag, robot)
     if found.warnings:
-        raise UndecidedError(_question(path, bag, found))
+        raise _UndecidedError(_question(path, bag, found))
     return Topics(robots=found.robots)
 
 
@@ -81,11 +80,11 @@ def _question(path: Path, bag: Bag, found: Proposal) -> str:
         head = f"{path}: `teamslam import {path} -o FOLDER` imports these topics as below.\n"
     return (
         head
-        + f"{listing(bag.topics)}\n"
+        + f"{_listing(bag.topics)}\n"
         + "".join(f"{doubt}\n" for doubt in found.warnings)
         + ("To decide" if found.warnings else "To change the roles")
         + ", write this into topics.toml:\n\n"
-        + as_toml(found)
+        + _as_toml(found)
         + f"\nand type: teamslam import {path} -o FOLDER --ros2 topics.toml (where there is no "
         "such file, this writes it)\n"
     )
@@ -218,8 +217,7 @@ def _tags_in(bag: Bag) -> set[str]:
     return found
 
 
-def listing(topics: list[Topic]) -> str:
-    """Describe a bag's topics, one per line."""
+def _listing(topics: list[Topic]) -> str:
     lines = []
     for topic in topics:
         used = "" if topic.kind in READERS else "   (not read here)"
@@ -227,8 +225,7 @@ def listing(topics: list[Topic]) -> str:
     return "\n".join(lines)
 
 
-def as_toml(found: Proposal) -> str:
-    """TOML file that assigns topics to robots."""
+def _as_toml(found: Proposal) -> str:
     lines = []
     for name, topics in found.robots.items():
         either = "".join(f'   # or "{other}"' for other in found.others.get(name, ()))
@@ -248,12 +245,12 @@ def as_toml(found: Proposal) -> str:
 def import_bag(
     path: Path, topics: Topics | None, robot: str | None, datum: Datum | None = None
 ) -> Report:
-    """Tables of a bag; raises BagError, UndecidedError.
+    """Tables of a bag; raises BagError, DatasetError.
 
     topics: None: from names and types. datum: where the topics give none; None: the first fix.
     """
     with opened_bag(path) as bag:
-        chosen = topics or decide_topics(bag, path, robot)
+        chosen = topics or _decide_topics(bag, path, robot)
         chosen = msgspec.structs.replace(
             chosen, datum=chosen.datum or datum or _first_fix(bag, chosen)
         )
@@ -268,16 +265,16 @@ def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
         for name, robot in topics.robots.items():
             topic = getattr(robot, role)
             if topic and of.setdefault(topic, name) != name:
-                raise UndecidedError(
+                raise _UndecidedError(
                     f"{path}: {topic} is the {role} of both {of[topic]} and {name}: in the file of "
                     "topics (--ros2 FILE) give it to its robot alone"
                 )
     for name, robot in topics.robots.items():
         for topic in (robot.odometry, *robot.detections, robot.fixes, robot.truth):
             if topic and topic not in present:
-                raise UndecidedError(
+                raise _UndecidedError(
                     f"{path}: no topic {topic}, which {name} is to have; there are:\n"
-                    + listing(bag.topics)
+                    + _listing(bag.topics)
                 )
 
 
@@ -308,7 +305,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Report:
                 tables[name].take(measured)
     questions = [text for each in translators.values() if (text := each.question())]
     if questions:
-        raise UndecidedError(f"{path}: {questions[0]}")
+        raise _UndecidedError(f"{path}: {questions[0]}")
     notes = [
         f"{topic}: {count} of {seen[topic]} messages dropped: damaged (first: {first[topic]})"
         for topic, count in sorted(damaged.items())

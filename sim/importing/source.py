@@ -373,11 +373,11 @@ def _write_scenario(tables: Sequence[RobotTables], datum: Datum | None, path: Pa
     if datum is not None:
         document["central"] = {"datum": msgspec.to_builtins(datum)}
         notes.append(f"fixes are east and north of the {origin}")
-    path.write_text(tomli_w.dumps(document) + "".join(map(robot_entry, robots)), "utf-8")
+    path.write_text(tomli_w.dumps(document) + "".join(map(_robot_entry, robots)), "utf-8")
     return notes
 
 
-def robot_entry(robot: Mapping[str, Any]) -> str:
+def _robot_entry(robot: Mapping[str, Any]) -> str:
     """TOML text of a robot's name, and the places of sensor and antenna."""
     places = [
         f"{part}.{name} = {place}\n"
@@ -442,7 +442,7 @@ def _with_robot(folder: Path, added: Path, robot: str) -> str:
             return ""
         entries = [*({"id": each} for each in robots_of(str(folder))), *entries]
     changed = text or tomli_w.dumps({key: own[key] for key in own if key != "robots"})
-    changed += "".join(map(robot_entry, entries))
+    changed += "".join(map(_robot_entry, entries))
     try:
         tomllib.loads(changed)
     except tomllib.TOMLDecodeError:

@@ -72,8 +72,7 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
     return [*watch.failures, *(each for each in texts if not any(not_joined([each])))]
 
 
-def starting(watch: Watch) -> str:
-    """Number of started robots, and the others."""
+def _starting(watch: Watch) -> str:
     missing = watch.missing_robots
     started = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
     if not missing:
@@ -105,8 +104,7 @@ def _behind_s(watch: Watch, world: m.Status) -> float:
     return max(0.0, 1e-9 * (world.stamp_ns - watch.fused.stamp_ns))
 
 
-def unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
-    """Unjoined robots, each with its failed test."""
+def _unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
     return [] if watch.fused is None else list(not_joined(watch.fused.reasons))
 
 
@@ -193,11 +191,11 @@ class _Lines:
             missing = watch.missing_robots
             lacking = world.warnings if is_live(watch) and not missing else ()
             self._shown |= {without_decimals(f"{DRIVERS}: {text}") for text in lacking}
-            return "; ".join(lacking) or starting(watch)
+            return "; ".join(lacking) or _starting(watch)
         submaps = sum(int(r.figures.get("submaps", 0)) for r in robots)
         fused = watch.fused
         landmarks = 0 if fused is None else len(fused.ids) // 4
-        waiting = ", ".join(who for who, _ in unjoined_robots(watch))
+        waiting = ", ".join(who for who, _ in _unjoined_robots(watch))
         apart = f"; not joined yet: {waiting}" if waiting else ""
         consistent = consistency(watch)
         return (
@@ -243,7 +241,7 @@ def _view(title: str, watch: Watch, width: int) -> Group:
         parts.append(Text(f"other commands reach the team by {watch.place}", style="dim"))
     robots = {n: watch.statuses[n] for n in in_order(watch.statuses) if n.startswith("robot/")}
     if world is None or world.state == "waiting":
-        parts.append(Text(starting(watch)))
+        parts.append(Text(_starting(watch)))
     else:
         bar = Table.grid(padding=(0, 2))
         bar.add_row(ProgressBar(total=1.0, completed=done(watch), width=36), share(watch))
@@ -339,7 +337,7 @@ def _map_lines(watch: Watch) -> list[str]:
         f"{figures.get('submaps', 0.0):.0f} submaps, {figures.get('broadcasts', 0.0):.0f} maps sent"
     ]
     lines += filter(None, [consistency(watch)])
-    return lines + [f"not joined yet: {who}: {why}" for who, why in unjoined_robots(watch)]
+    return lines + [f"not joined yet: {who}: {why}" for who, why in _unjoined_robots(watch)]
 
 
 def _number(value: float | None, form: str) -> str:

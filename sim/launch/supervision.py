@@ -106,8 +106,7 @@ the recorder has received nothing.
 _WITHOUT_IT_NO_MAP = frozenset({"router", "world", "central"})
 
 
-def node_of(name: str) -> str:
-    """Node of a process: `robot-r1` is `robot/r1`."""
+def _node_of(name: str) -> str:
     return f"robot/{name.removeprefix('robot-')}" if name.startswith("robot-") else name
 
 
@@ -127,7 +126,7 @@ def supervise(
     end_silent_s: silence [s] after which a process is ended, to be restarted.
     """
     silence, memory = Silence(end_silent_s), Memory()
-    leaving: Leaving | None = None
+    leaving: _Leaving | None = None
     while True:
         _receive(bus, watch)
         is_final = watch.is_over
@@ -140,7 +139,7 @@ def supervise(
         show(watch)
         if not any(service.is_watched for service in services[1:]):
             return
-        leaving = leaving or (Leaving() if is_final else None)
+        leaving = leaving or (_Leaving() if is_final else None)
         if leaving is not None and leaving.stands_still(services, watch):
             _end_who_stays(services[1:], watch)
             return
@@ -174,7 +173,7 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
             watch.failures += [] if names_only(ended, lacking_in(watch)) else [failure(ended)]
         return
     ended = service.child.ended()
-    service.died(watch.progress(node_of(service.name)))
+    service.died(watch.progress(_node_of(service.name)))
     if not service.given_up:
         watch.restarts[service.name] = service.restarts + 1
         watch.note(f"{ended.name} (pid {ended.pid}) {ended.how}: it is started again")
@@ -182,16 +181,14 @@ def _look_after(service: Supervised, bus: Bus, watch: Watch, *, is_final: bool) 
     deaths = f"it died {service.fruitless} times without progress, and is given up"
     watch.given_up.append(service.name)
     watch.failures.append(f"{failure(ended)}; {deaths}")
-    node = node_of(service.name)
+    node = _node_of(service.name)
     order = m.GivenUp(stamp_ns=0, node=node, by="launch", reason=f"{ended.how}; {deaths}")
     if not _is_needed(service.name, watch):
         with suppress(BusError):  # reported by `_receive`
             publish_order(bus, Outgoing(ch.GIVEN_UP, node, order), watch.signer)
 
 
-class Leaving:
-    """End of a run, when processes leave."""
-
+class _Leaving:
     def __init__(self) -> None:
         self._reached = (-1, -1.0)
         self._since_s = 0.0
@@ -250,7 +247,7 @@ class Silence:
             if not service.is_watched or service.due is not None or child.exit is not None:
                 self._silent.discard(child.pid)
                 continue
-            last_message = watch.last_message.get(node_of(service.name), 0.0)
+            last_message = watch.last_message.get(_node_of(service.name), 0.0)
             if service.name == "router":  # has no messages: all others are silent with it
                 last_message = max(watch.last_message.values(), default=0.0)
             silent_s = now - max(last_message, child.started)

@@ -52,7 +52,7 @@ class Configurations:
                 + REMEDY
             )
         elif announced.digest != expected.digest:
-            found = differences(announced.configuration, expected.configuration)
+            found = _differences(announced.configuration, expected.configuration)
             more = f", and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
             self._mismatches[node] = (
                 f"{node} differs from the world's scenario: {', '.join(found[:SHOWN])}{more}: "
@@ -79,8 +79,7 @@ class Configurations:
         return sorted((self._expected.keys() & set(nodes)) - self._announced)
 
 
-def differences(announced: str, expected: str) -> list[str]:
-    """Differing fields of two JSON configurations."""
+def _differences(announced: str, expected: str) -> list[str]:
     theirs, ours = dict(_fields(json.loads(announced))), dict(_fields(json.loads(expected)))
     return [
         f"{name} is {theirs.get(name, 'absent')} there and {ours.get(name, 'absent')} here"

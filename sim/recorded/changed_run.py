@@ -57,15 +57,14 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     RerunError.
     """
     world = RecordedWorld(log, changes.without)
-    scenario = changed_scenario(world.scenario, changes)
+    scenario = _changed_scenario(world.scenario, changes)
     world.announce(scenario)
     world.load_maps(read_map(Path(path)) for path in changes.maps)
     conditions = _conditions(scenario, changes, world.first_ns)
     return list(run_nodes(scenario, world, conditions))
 
 
-def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
-    """The recorded scenario with the changes; raises ScenarioError."""
+def _changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
     names = [robot.id for robot in scenario.robots]
     asked = {*changes.without, *(r for robots, _ in changes.partitions for r in robots)}
     for name in sorted(each for each in asked - set(names) if not each.startswith(MAP)):
@@ -77,7 +76,7 @@ def changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
     front = {name: value for name, value in front.items() if value is not None}
     noise = dict(changes.noise)
     robots = tuple(
-        with_noise(
+        _with_noise(
             msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, **front)),
             noise,
         )
@@ -123,8 +122,7 @@ KINDS: Mapping[str, str] = MappingProxyType(
 """Kinds of noise, and the scaled parameters."""
 
 
-def with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
-    """Scale standard deviations by the factor of their kind."""
+def _with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
     motion = _motion(robot.motion, factors.get("odometry", 1.0))
     by_range = factors.get("range", 1.0)
     sensor: Sensor = msgspec.structs.replace(

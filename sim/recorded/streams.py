@@ -118,7 +118,7 @@ def _stream(
     fixes = [each for each in measurements if isinstance(each, m.Fix)]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
     intervals = intervals_of(robot, odometry, clock_offset_s)
-    mixed = (forms_of(odometry), forms_of(seen))
+    mixed = (_forms_of(odometry), _forms_of(seen))
     truth = sorted(truth, key=lambda each: each.stamp_ns)
     times = [stamps(each.stamps, "stamps") for each in truth]
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
@@ -169,8 +169,7 @@ FORM_NAMES = {
 """Names of the forms of measurements."""
 
 
-def forms_of(messages: Sequence[m.Measurement]) -> str:
-    """Describe the forms with their counts if there are several."""
+def _forms_of(messages: Sequence[m.Measurement]) -> str:
     kinds = [type(each) for each in messages]
     counts = {kind: kinds.count(kind) for kind in FORM_NAMES if kind in kinds}
     if len(counts) < 2:
@@ -199,7 +198,7 @@ def intervals_of(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: 
     kinds = {type(each) for each in odometry} - {m.Increment}
     if len(kinds) > 1:
         raise ValueError(
-            f"{robot}: its odometry has {forms_of(odometry)}; speeds are of one kind in a stream"
+            f"{robot}: its odometry has {_forms_of(odometry)}; speeds are of one kind in a stream"
         )
     return Intervals(
         end_ns=np.array(ends, dtype=np.int64),

@@ -244,7 +244,7 @@ def _fit_count(robots: Sequence[Fields], count: int, names: Sequence[str]) -> li
 
 
 def _convert(fields: Fields) -> Scenario:
-    check_world(checked_table(fields.get("world", {}), "world"))
+    _check_world(checked_table(fields.get("world", {}), "world"))
     for choice, declared in (
         ("estimator", Estimator),
         ("fusion", FusionRule),
@@ -348,8 +348,7 @@ WORLDS: dict[str, type[World]] = {
 }
 
 
-def check_world(world: Fields) -> None:
-    """Check a world's kind and field names."""
+def _check_world(world: Fields) -> None:
     kind = world.get("kind")
     if not isinstance(kind, str) or kind not in WORLDS:
         raise ScenarioError(_which(kind))

@@ -47,7 +47,7 @@ def streams_of(scenario: Scenario) -> WorldStreams:
             "measurements (docs/your_robot.md); for recorded data give --dataset"
         )
     if isinstance(world, SimulatedWorld):
-        seed = noise_seed(scenario)
+        seed = _noise_seed(scenario)
         streams = simulate(world, scenario.robots, seed)
         tagged = world.tagged if world.identities == "hidden" else 1.0
         hiding = Hiding(tagged, world.missed, world.clutter, world.visible_to_m)
@@ -119,7 +119,7 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
     return needed
 
 
-def noise_seed(scenario: Scenario) -> int:
+def _noise_seed(scenario: Scenario) -> int:
     """Key of random numbers, from scenario name and seed: a positive 63-bit integer."""
     text = f"{scenario.name}/{scenario.seed}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

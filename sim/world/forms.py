@@ -10,7 +10,7 @@ from teamslam.team.shapes import Float
 Column = Float[np.ndarray, " K"]
 
 
-def deviation(noise: MotionNoise, seconds: Column, steps: Float[np.ndarray, "K 2"]) -> Column:
+def _deviation(noise: MotionNoise, seconds: Column, steps: Float[np.ndarray, "K 2"]) -> Column:
     """σ = √(per_s² t + per_m² |distance| + per_rad² |rotation|) of one noise in each step."""
     distance, turn = np.abs(steps).T
     per_s, per_m, per_rad = noise.per_s, noise.per_m, noise.per_rad
@@ -33,8 +33,8 @@ def measured_speeds(
     are divided by the scales.
     """
     of_way, of_turn, _ = _interval_deviations(motion, steps, seconds)
-    forward = core.hypot(deviation(motion.forward, seconds, steps), of_way)
-    turn = core.hypot(deviation(motion.turn, seconds, steps), of_turn)
+    forward = core.hypot(_deviation(motion.forward, seconds, steps), of_way)
+    turn = core.hypot(_deviation(motion.turn, seconds, steps), of_turn)
     if motion.shares is not None:
         along, _, heading = _of_the_way(motion, steps, seconds)
         forward, turn = core.hypot(forward, along), core.hypot(turn, heading)
@@ -56,11 +56,11 @@ def slip(
     """Final rotation [rad] and left slip [m], which odometry does not measure."""
     steps, duration = np.array([step]), np.array([seconds])
     _, _, of_turn = _interval_deviations(motion, steps, duration)
-    turn = core.hypot(deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
-    left = deviation(motion.lateral, duration, steps) * normals[1]
+    turn = core.hypot(_deviation(motion.final_turn, duration, steps), of_turn) * normals[0]
+    left = _deviation(motion.lateral, duration, steps) * normals[1]
     if motion.shares is not None:
         sigma = core.hypot(
-            deviation(motion.lateral, duration, steps), _of_the_way(motion, steps, duration)[1]
+            _deviation(motion.lateral, duration, steps), _of_the_way(motion, steps, duration)[1]
         )
         left = sigma * normals[1]
     return turn.item(), left.item()
@@ -153,7 +153,7 @@ def measured_increments(
     true_turn = after[:, 2] - before[:, 2]
     displacement = _turn(after[:, :2] - before[:, :2], -before[:, 2])
     kinds = (motion.forward, motion.lateral, motion.turn)
-    sigmas = np.column_stack([deviation(kind, seconds, steps) for kind in kinds])
+    sigmas = np.column_stack([_deviation(kind, seconds, steps) for kind in kinds])
     shares = np.sqrt(1.0 - correlation**2)
     ahead, left, turn = sigmas.T * normals.T
     left = correlation * sigmas[:, 1] * normals[:, 2] + shares * left

@@ -89,7 +89,7 @@ def generator(seed: int, *names: str) -> np.random.Generator:
 
 def _landmarks(world: SimulatedWorld, seed: int) -> Float[np.ndarray, "L 2"]:
     if world.landmark_count and world.layout != "uniform":
-        return laid_out(world, generator(seed, "world", "landmarks"))
+        return _laid_out(world, generator(seed, "world", "landmarks"))
     if world.landmark_count:
         uniform = generator(seed, "world", "landmarks").random((world.landmark_count, 2))
         return _places(world, uniform)
@@ -386,8 +386,7 @@ INNER = 0.1
 """Least wall distance of a landmark, as a share of a room's side."""
 
 
-def laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
-    """Draw landmark_count points, rounded down to equal rooms."""
+def _laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:
     if world.layout == "twins":
         return _twins(world, rng)
     side = world.size_m / world.rooms

@@ -32,9 +32,7 @@ PINNED_SIGMA = 1e-6
 """Standard deviation [m, rad] between base and mounted sensor: the least for GTSAM."""
 
 
-class Look(NamedTuple):
-    """Landmark measurement `number` of a scan; before: gap_s earlier."""
-
+class _Look(NamedTuple):
     key: int
     chain: int
     pose: int
@@ -51,9 +49,8 @@ def bias_key(chain: int) -> int:
     return _BIASES + chain
 
 
-def detections_of(chains: Sequence[Chain]) -> list[Look]:
-    """List all measurements in order."""
-    looks: list[Look] = []
+def _detections_of(chains: Sequence[Chain]) -> list[_Look]:
+    looks: list[_Look] = []
     for c, chain in enumerate(chains):
         last: dict[int, tuple[int, int]] = {}
         for i, scan in enumerate(chain.scans, 1):
@@ -64,7 +61,7 @@ def detections_of(chains: Sequence[Chain]) -> list[Look]:
                 before, then_ns = last.get(landmark, (None, stamp_ns))
                 gap_s = 1e-9 * (stamp_ns - then_ns)
                 looks.append(
-                    Look(
+                    _Look(
                         key=key,
                         chain=c,
                         pose=i,
@@ -100,7 +97,7 @@ def profile_graph(
             deviations = [getattr(sigmas, b) if b in biases else 1e-6 for b in BIASES]
             model = gtsam.noiseModel.Diagonal.Sigmas(np.array(deviations))
             graph.push_back(gtsam.PriorFactorPoint3(bias_key(c), np.zeros(3), model))
-    for look in detections_of(chains):
+    for look in _detections_of(chains):
         sensor = chains[look.chain].config.sensor
         graph.push_back(_process_factor(gtsam, look, sensor))
         distance, _ = predicted(poses[look.chain][look.pose], landmarks[look.landmark])
@@ -135,7 +132,7 @@ def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
     for c, i in _bases(chains):
         pose = values.atPose2(pose_key(c, i)).compose(gtsam.Pose2(*chains[c].mount).inverse())
         values.insert(_base_key(chains[c], c, i), pose)
-    for look in detections_of(chains):
+    for look in _detections_of(chains):
         values.insert(look.key, np.zeros(2))
     for c, chain in enumerate(chains):
         if has_biases(chain):
@@ -144,7 +141,7 @@ def add_errors(gtsam: Any, values: Any, chains: Sequence[Chain]) -> Any:
 
 
 def _measurement(
-    look: Look, keys: Sequence[int], scales: Float[np.ndarray, "2"]
+    look: _Look, keys: Sequence[int], scales: Float[np.ndarray, "2"]
 ) -> Callable[[Any, Any, Any], np.ndarray]:
     """Residual (bearing [rad], range [m]), and derivatives by `keys`."""
     across, along = scales.tolist()
@@ -176,7 +173,7 @@ def _measurement(
     return residual
 
 
-def _process_factor(gtsam: Any, look: Look, sensor: Sensor) -> Any:
+def _process_factor(gtsam: Any, look: _Look, sensor: Sensor) -> Any:
     """e(t') − a e(t) ~ N(0, 1 − a²) of (bearing, range); the first has no e(t)."""
     times = (sensor.bearing_correlation_s, sensor.range_correlation_s)
     a = np.array([math.exp(-look.gap_s / tau) if tau > 0.0 else 0.0 for tau in times])

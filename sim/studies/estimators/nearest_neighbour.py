@@ -23,29 +23,27 @@ from teamslam.team.shapes import Float, Int64, UInt32
 
 
 @dataclass(frozen=True)
-class NearestNeighbour:
-    """Filter, and the landmark of each detection so far."""
-
+class _NearestNeighbour:
     slam: EkfSlam
     took: tuple[Int64[np.ndarray, " _"], ...] = ()
 
 
-def initial_state(pose: Pose) -> NearestNeighbour:
+def initial_state(pose: Pose) -> _NearestNeighbour:
     """Start at an exact pose."""
-    return NearestNeighbour(ekf_slam.initial_state(pose))
+    return _NearestNeighbour(ekf_slam.initial_state(pose))
 
 
-def filter_step(state: NearestNeighbour, step: RobotStep) -> NearestNeighbour:
+def filter_step(state: _NearestNeighbour, step: RobotStep) -> _NearestNeighbour:
     """Move, associate detections (ids from UNNAMED on), and update at once."""
     unnamed = np.flatnonzero(step.ids >= UNNAMED)
     if not len(unnamed):
         return replace(state, slam=ekf_slam.filter_step(state.slam, step))
     slam, given = _move_and_name(state.slam, step)
     slam = ekf_slam.filter_step(slam, step._replace(increment=Increment.identity(), ids=given))
-    return NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
+    return _NearestNeighbour(slam, (*state.took, given[unnamed].astype(np.int64)))
 
 
-def innovation(state: NearestNeighbour, step: RobotStep) -> Innovation:
+def innovation(state: _NearestNeighbour, step: RobotStep) -> Innovation:
     """Innovation of the used measurements."""
     if (step.ids >= UNNAMED).any():
         step = step._replace(ids=_move_and_name(state.slam, step)[1])
@@ -67,7 +65,7 @@ def _associate(
     bearings: Float[np.ndarray, " n"],
 ) -> UInt32[np.ndarray, " n"]:
     known = np.flatnonzero(slam.ids >= UNNAMED)
-    predicted, spread = predictions(slam, known)
+    predicted, spread = _predictions(slam, known)
     R = np.zeros((len(ranges), 2, 2))
     R[:, 0, 0] = core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * ranges)
     R[:, 1, 1] = core.squared(sensor.bearing_sigma)
@@ -82,7 +80,7 @@ def _associate(
     return numbers
 
 
-def predictions(
+def _predictions(
     slam: EkfSlam, which: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m 2 2"]]:
     """(range, bearing) of these landmarks and H P Hᵀ, without the sensor's noise."""

@@ -83,7 +83,7 @@ def solve(state: SubmapJoining) -> SubmapJoining:
     return replace(state, fold=joining.solve_fold(state.fold, SETTINGS))
 
 
-def variance_factor(state: SubmapJoining) -> float:
+def _variance_factor(state: SubmapJoining) -> float:
     """Variance factor σ̂².
 
     With the identity Σ‖r‖²/(residuals − unknowns), 1 without redundancy; else 1.
@@ -100,7 +100,7 @@ def landmark_gaussian(state: SubmapJoining) -> LandmarkGaussian:
     landmarks = state.fold.main.graph.landmarks
     ids = sorted(landmarks)
     mean, covariance = joint_marginal(state.fold.main, [landmarks[id_] for id_ in ids])
-    factor = variance_factor(state)
+    factor = _variance_factor(state)
     return LandmarkGaussian(np.array(ids, np.uint32), mean.reshape(-1, 2), factor * covariance)
 
 
@@ -114,7 +114,7 @@ class PointPairs(NamedTuple):
 NO_PAIRS = PointPairs(np.empty((0, 2)), np.empty((0, 2)))
 
 
-class ExchangedMap(NamedTuple):
+class _ExchangedMap(NamedTuple):
     """Union of two maps, and the second's pose in the first."""
 
     landmarks: LandmarkGaussian
@@ -138,7 +138,7 @@ def mutual_sighting(
 
 def exchange_maps(
     a: LandmarkGaussian, b: LandmarkGaussian, robots: PointPairs = NO_PAIRS
-) -> ExchangedMap:
+) -> _ExchangedMap:
     """Join two maps in the frame of a, by common landmarks and the robots' positions.
 
     argmin Σ ‖aᵢ − xᵢ‖² + Σ ‖R bᵢ + t − xᵢ‖² over x and (R, t): (R, t) is by `procrustes`. With n
@@ -168,7 +168,7 @@ def exchange_maps(
     E = np.repeat(from_b, 2)[:, None] * slopes
     own = variance * np.where(common, 0.5, 1.0)
     covariance = np.diag(np.repeat(own, 2)) + dense.product(dense.product(E, of_motion), E.T)
-    return ExchangedMap(
+    return _ExchangedMap(
         LandmarkGaussian(ids, means, 0.5 * (covariance + covariance.T)),
         PoseGaussian(a_from_b, of_motion),
     )
@@ -192,7 +192,7 @@ STANDS_STILL = 1e-9
 """Largest change of a coordinate [m, rad] in the last step."""
 
 
-def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMap:
+def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> _ExchangedMap:
     """Join two maps in the frame of a, with their covariances.
 
     argmin ‖x_a − a‖² in A⁻¹ + ‖Rᵀ(x_b − t) − b‖² in B⁻¹ over x and (t, θ); covariance (JᵀWJ)⁻¹.
@@ -222,7 +222,7 @@ def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> ExchangedMa
         state[2] = wrapped(state[2])
         if np.abs(step).max() < STANDS_STILL:
             break
-    return ExchangedMap(
+    return _ExchangedMap(
         LandmarkGaussian(ids, state[3:].reshape(-1, 2), covariance[3:, 3:]),
         PoseGaussian(state[:3], covariance[:3, :3]),
     )

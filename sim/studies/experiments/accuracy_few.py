@@ -46,7 +46,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     """Frequency of wrong maps, warned and silent."""
     figures: dict[str, Figures] = {}
     for name, case in _cases(options).items():
-        figures[name] = few_figures(results.of_all(case))
+        figures[name] = _few_figures(results.of_all(case))
     judged = [of_case for of_case in figures.values() if "silent" in of_case]
     runs = sum(of_case["seeds"] for of_case in judged)
     table = table_of(
@@ -72,8 +72,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     return Outcome("few landmarks", {"few": figures}, (table,), goals=tuple(goals))
 
 
-def few_figures(runs: list[Figures]) -> Figures:
-    """Figures over the seeds of one case."""
+def _few_figures(runs: list[Figures]) -> Figures:
     figures = over_seeds(runs)
     if not runs:
         return figures
@@ -81,7 +80,7 @@ def few_figures(runs: list[Figures]) -> Figures:
     warned = [bool(run["reasons"]) for run in runs]
     wrong = [of_run["wrong"] for of_run in minima]
     excluded = [of_run["excluded"] for of_run in minima]
-    beyond = [is_beyond(run) for run in runs]
+    beyond = [_is_beyond(run) for run in runs]
     bad = [any(each) for each in zip(wrong, excluded, beyond, strict=True)]
     return figures | {
         "aligned_median": middle(run["rmse_aligned"] for run in runs),
@@ -104,7 +103,7 @@ def _alarmed(run: Figures) -> bool:
     return any(not any(words in text for words in WIDE) for text in run["reasons"])
 
 
-def is_beyond(run: Figures) -> bool:
+def _is_beyond(run: Figures) -> bool:
     """Whether shape or a first pose is outside its 99.9 % ellipsoid."""
     dof = 2 * round(run["landmarks"] or 0.0) - 3
     shape = run["shape_nees"]

@@ -53,7 +53,7 @@ def outcome(options: Options, results: Results) -> Outcome:
         )
     figures, unknown = (
         {
-            dataset.name: set_figures(run)
+            dataset.name: _set_figures(run)
             for dataset in options.datasets
             if (run := results.of(task_on(dataset))) is not None
         }
@@ -91,8 +91,7 @@ def outcome(options: Options, results: Results) -> Outcome:
     )
 
 
-def set_figures(run: Figures) -> Figures:
-    """Figures of one set."""
+def _set_figures(run: Figures) -> Figures:
     renamed = {
         "aligned": "rmse_aligned",
         "raw": "rmse",
@@ -103,7 +102,7 @@ def set_figures(run: Figures) -> Figures:
         name: value for name, value in run.items() if name not in renamed.values()
     }
     if "batch" in run:
-        figures["batch"] = set_figures(run["batch"])
+        figures["batch"] = _set_figures(run["batch"])
     return figures
 
 

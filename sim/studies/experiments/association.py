@@ -35,22 +35,20 @@ MISSED = (0.0, 0.1, 0.2, 0.3, 0.5)
 RATIO, FEW = 20.0, 2
 
 
-class System(NamedTuple):
-    """Estimator and rule; named: landmarks have identities."""
-
+class _System(NamedTuple):
     name: str
     estimator: Estimator
     fusion: FusionRule
     named: bool = False
 
 
-OURS = System("ours", "hybrid", "join")
-NAMED = System("with names", "hybrid", "join", named=True)
+OURS = _System("ours", "hybrid", "join")
+NAMED = _System("with names", "hybrid", "join", named=True)
 SYSTEMS = (
     OURS,
     NAMED,
-    System("EKF, nearest neighbour", "ekf-slam", "alone"),
-    System("FastSLAM, likelihood", "fastslam1", "alone"),
+    _System("EKF, nearest neighbour", "ekf-slam", "alone"),
+    _System("FastSLAM, likelihood", "fastslam1", "alone"),
 )
 AXES: dict[str, tuple[float, ...]] = {
     "spacing / noise": RATIOS,
@@ -74,7 +72,7 @@ def _values(axis: str, options: Options) -> Sequence[float]:
     return values[:: max(len(values) // FEW, 1)] if options.quick else values
 
 
-def _tasks(axis: str, value: float, system: System, options: Options) -> list[Task]:
+def _tasks(axis: str, value: float, system: _System, options: Options) -> list[Task]:
     ratio = value if axis == "spacing / noise" else RATIO
     clutter = value if axis == "clutter" else 0.0
     missed = value if axis == "missed" else 0.0
@@ -185,13 +183,12 @@ def _means(runs: Sequence[dict[str, Any]]) -> dict[str, float | None]:
 
 def _picture(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> Picture:
     def draw(path: Path) -> None:
-        draw_curves(axis, of_axis).savefig(path, dpi=120)
+        _draw_curves(axis, of_axis).savefig(path, dpi=120)
 
     return Picture(axis.replace(" / ", "-"), f"Association over {axis}.", draw)
 
 
-def draw_curves(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
-    """Six panels, a colour per system."""
+def _draw_curves(axis: str, of_axis: dict[str, dict[str, dict[str, float | None]]]) -> "Figure":
     shown = [each for each in FIGURES if each[0] not in ("wrong_percent", "gospa")]
     made = figure(12.0, 6.0)
     colours = {system.name: f"C{k}" for k, system in enumerate(SYSTEMS)}

@@ -144,22 +144,20 @@ class ShardError(ValueError):
 
 
 @dataclass(frozen=True)
-class Shard:
-    """Shard `number` of `of`, from 1."""
-
+class _Shard:
     number: int
     of: int
 
 
-def parsed_shard(text: str) -> Shard:
+def parsed_shard(text: str) -> _Shard:
     """Parse `I/N`; raises ShardError."""
     found = re.fullmatch(r"(\d+)/(\d+)", text)
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         raise ShardError(f"--shard {text}: give the shard and their number, as 2/8")
-    return Shard(int(found[1]), int(found[2]))
+    return _Shard(int(found[1]), int(found[2]))
 
 
-def tasks_of(tasks: Mapping[str, Task], shard: Shard) -> dict[str, Task]:
+def tasks_of(tasks: Mapping[str, Task], shard: _Shard) -> dict[str, Task]:
     """Every N-th task by falling cost, for shards of equal time."""
     order = sorted(tasks.values(), key=lambda task: (-task.cost, task.name))
     return {task.name: task for task in order[shard.number - 1 :: shard.of]}
@@ -170,7 +168,7 @@ def programs_of(tasks: Sequence[Task]) -> dict[str, str]:
     return {task.work: task.program for task in {task.work: task for task in tasks}.values()}
 
 
-def write_shard(folder: Path, shard: Shard, study: Study, programs: Mapping[str, str]) -> None:
+def write_shard(folder: Path, shard: _Shard, study: Study, programs: Mapping[str, str]) -> None:
     """Describe the shard in its folder."""
     content = asdict(study) | {
         "program": dict(sorted(programs.items())),

@@ -100,7 +100,7 @@ QUICK_S = 300.0
 TEAM = "team"
 
 
-class Method(NamedTuple):
+class _Method(NamedTuple):
     """Row: name, and a figure per robot or of the team."""
 
     name: str
@@ -108,7 +108,7 @@ class Method(NamedTuple):
     colour: str
 
 
-class Compared(NamedTuple):
+class _Compared(NamedTuple):
     """Paired t-test: text, printed p, two sides by set.
 
     before: the other table's row by method.
@@ -120,7 +120,7 @@ class Compared(NamedTuple):
     printed_before: Mapping[str, Sequence[float]]
 
 
-class PrintedTable(NamedTuple):
+class _PrintedTable(NamedTuple):
     """Table of the thesis. printed: figures by set number.
 
     sample: run whose map is drawn, as in figure 5.1.
@@ -129,9 +129,9 @@ class PrintedTable(NamedTuple):
     title: str
     columns: tuple[str, ...]
     printed: Mapping[str, Sequence[float]]
-    methods: tuple[Method, ...]
+    methods: tuple[_Method, ...]
     remarks: tuple[str, ...]
-    compared: Compared | None = None
+    compared: _Compared | None = None
     sample: Callable[[Options, Dataset], Task] | None = None
 
     def outcome(self, options: Options, results: Results) -> Outcome:
@@ -321,7 +321,7 @@ def _test(pairs_of_sets: Sequence[Sequence[tuple[float, float]]]) -> Figures:
     }
 
 
-def _test_table(compared: Compared | None, tests: Mapping[str, Figures]) -> Table:
+def _test_table(compared: _Compared | None, tests: Mapping[str, Figures]) -> Table:
     text, printed = ("", 0.0) if compared is None else (compared.text, compared.printed_p)
     shown = (
         ("pairs", "pairs", "{}"),
@@ -375,18 +375,18 @@ _DIFFERS = (
 def _pair(
     rows: Callable[[int, str], Callable[[Options, Dataset, Results], Row]],
     figures: Sequence[str],
-) -> tuple[Method, ...]:
-    found: list[Method] = []
+) -> tuple[_Method, ...]:
+    found: list[_Method] = []
     for k, name in enumerate((HIS, OURS)):
         for source in figures:
             full = f"{name}, aligned" if source.endswith("aligned") else name
-            found.append(Method(full, rows(k, source), _COLOURS[len(found)]))
+            found.append(_Method(full, rows(k, source), _COLOURS[len(found)]))
     return tuple(found)
 
 
 _EKFS = (_HIS_EKF, _OUR_EKF)
 _MAPS = ("rmse", "rmse_aligned")
-TABLE_5_1 = PrintedTable(
+TABLE_5_1 = _PrintedTable(
     "Downs, table 5.1: maps of the EKF, one robot",
     _ROBOTS,
     EKF_MAPS,
@@ -399,7 +399,7 @@ TABLE_5_1 = PrintedTable(
     ),
     sample=_HIS_EKF,
 )
-TABLE_5_2 = PrintedTable(
+TABLE_5_2 = _PrintedTable(
     "Downs, table 5.2: paths of the EKF, one robot",
     _ROBOTS,
     EKF_PATHS,
@@ -417,7 +417,7 @@ def _joined_row(k: int, name: str) -> Callable[[Options, Dataset, Results], Row]
     return _of_robots(_spherical, name) if k == 0 else _of_singles(name)
 
 
-TABLE_5_3 = PrintedTable(
+TABLE_5_3 = _PrintedTable(
     "Downs, table 5.3: joined maps, one robot",
     _ROBOTS,
     JOINED_MAPS,
@@ -428,14 +428,14 @@ TABLE_5_3 = PrintedTable(
         "and 7 of the printed table are equal: these figures are not verified. The t-test of the "
         "45 printed pairs gives another p than the text.",
     ),
-    Compared(
+    _Compared(
         "EKF maps (table 5.1) against joined maps (table 5.3)",
         P_EKF_JOINED,
         {HIS: _of_robots(_HIS_EKF, "rmse"), OURS: _of_robots(_OUR_EKF, "rmse")},
         EKF_MAPS,
     ),
 )
-TABLE_5_4 = PrintedTable(
+TABLE_5_4 = _PrintedTable(
     "Downs, table 5.4: smoothed paths, one robot",
     _ROBOTS,
     SMOOTHED_PATHS,
@@ -452,7 +452,7 @@ def _team_row(k: int, name: str) -> Callable[[Options, Dataset, Results], Row]:
     return partial(_of_spherical_team if k == 0 else _of_team, name=name)
 
 
-TABLE_5_5 = PrintedTable(
+TABLE_5_5 = _PrintedTable(
     "Downs, table 5.5: joined maps of five robots",
     (TEAM,),
     {number: (error,) for number, error in TEAM_MAPS.items()},
@@ -463,7 +463,7 @@ TABLE_5_5 = PrintedTable(
         "by singular values over the common landmarks and the robots' own positions at every "
         "mutual sighting. Ours joins all submaps in one frame, with inter-robot measurements.",
     ),
-    Compared(
+    _Compared(
         "the mean of single joined maps (table 5.3) against the team's (table 5.5)",
         P_JOINED_TEAM,
         {HIS: _joined_row(0, "rmse"), OURS: _joined_row(1, "rmse")},

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-class ErrorFigure(NamedTuple):
+class _ErrorFigure(NamedTuple):
     """Errors over frames. of: "path" of robot 1, or "map", its landmarks' mean distance.
 
     printed: mean error [m] by method.
@@ -137,21 +137,21 @@ _POSES = (
     "poses of all robots with so few particles degenerates, however: each resampling discards "
     "paths of all robots, and the reported σ is far too small (NEES)."
 )
-FIGURE_4A = ErrorFigure(
+FIGURE_4A = _ErrorFigure(
     "Ma & Ma, figure 4(a): path, dead reckoning against single FastSLAM",
     "path",
     (DEAD_RECKONING, SINGLE),
     {SINGLE.name: 0.6},
     (_PROGRAM, _RAW),
 )
-FIGURE_4B = ErrorFigure(
+FIGURE_4B = _ErrorFigure(
     "Ma & Ma, figure 4(b): path of single FastSLAM",
     "path",
     (SINGLE,),
     {SINGLE.name: 0.6},
     (_PROGRAM, _RAW),
 )
-FIGURE_4C = ErrorFigure(
+FIGURE_4C = _ErrorFigure(
     "Ma & Ma, figure 4(c): landmarks of single FastSLAM",
     "map",
     (SINGLE,),
@@ -165,14 +165,14 @@ FIGURE_4C = ErrorFigure(
     ),
 )
 _TEAMS = (SINGLE, MULTI_3, MULTI_5, OURS)
-FIGURE_6A = ErrorFigure(
+FIGURE_6A = _ErrorFigure(
     "Ma & Ma, figure 6(a): path of robot 1, single against multi",
     "path",
     _TEAMS,
     {SINGLE.name: 0.6, MULTI_3.name: 0.42},
     (_PROGRAM, _RAW, _POSES),
 )
-FIGURE_6B = ErrorFigure(
+FIGURE_6B = _ErrorFigure(
     "Ma & Ma, figure 6(b): landmarks, single against multi",
     "map",
     _TEAMS,
@@ -184,9 +184,7 @@ FIGURE_6B = ErrorFigure(
 CLOUD_COLOUR = SKY
 
 
-class PathFigure(NamedTuple):
-    """Paths of some methods side by side."""
-
+class _PathFigure(NamedTuple):
     title: str
     methods: tuple[Method, ...]
     remark: str
@@ -275,7 +273,7 @@ def _draw_paths(axis: "Axes", run: Figures) -> None:
     axis.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
 
 
-FIGURE_3 = PathFigure(
+FIGURE_3 = _PathFigure(
     "Ma & Ma, figure 3",
     (DEAD_RECKONING, SINGLE),
     "The report prints the paths without figures. Its dead reckoning is the particle filter "
@@ -283,7 +281,7 @@ FIGURE_3 = PathFigure(
     "end and (b) the cloud. The odometry is as logged; with the calibrated models of the scenario "
     "`utias` dead reckoning drifts less.",
 )
-FIGURE_5 = PathFigure(
+FIGURE_5 = _PathFigure(
     "Ma & Ma, figure 5",
     (MULTI_3, MULTI_5),
     "The report shows three robots and names a video of five. The poses are the centre's, at "

@@ -34,7 +34,7 @@ IN_THE_LABEL = frozenset({"name", "team", "seed", "estimator", "fusion", "robots
 COPIES = frozenset({"robots.seed", "robots.estimator", "robots.fusion", "central.fusion"})
 
 
-def kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
+def _kinds_of(tasks: Sequence[Task]) -> list[tuple[str, int, str]]:
     """Label, number and parameters of runs that differ in seed only."""
     found: dict[tuple[str, str], int] = {}
     for task in tasks:
@@ -173,7 +173,7 @@ def compute_runs(
 def _conclude(plan: Plan, results: Results, failures: Mapping[str, "Done"]) -> Concluded:
     failed = {task.label: failures[task.name].error for task in plan.tasks if task.name in failures}
     outcome = plan.experiment.outcome(plan.options, results)
-    kinds = kinds_of(plan.tasks)
+    kinds = _kinds_of(plan.tasks)
     return Concluded(plan.entry, plan.options, outcome, len(plan.tasks), failed, kinds)
 
 

@@ -21,7 +21,7 @@ _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 """A name in a table of `teamslam.team.registry`."""
 
 
-def sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
+def _sources_of(module: str, packages: tuple[str, ...]) -> dict[str, bytes]:
     """Text of a module and of all that it imports of these packages.
 
     Names in tables (`teamslam.team.registry`) count as imports.
@@ -112,7 +112,7 @@ def program_of(module: str) -> str:
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:
         digest.update(f"{library} {_version(library)}\n".encode())
-    for name, source in sorted(sources_of(module, ROOTS).items()):
+    for name, source in sorted(_sources_of(module, ROOTS).items()):
         digest.update(f"{name}\n".encode() + source)
     digest.update(core.digest.encode())
     return digest.hexdigest()

@@ -145,7 +145,7 @@ def team_run(
             figures["minimum"] = found._asdict() | verdicts
     if batch:
         try:
-            figures["batch"] = reference_figures(batch_map(samples, noise))
+            figures["batch"] = _reference_figures(batch_map(samples, noise))
         except BatchReferenceError as error:
             figures["batch_error"] = str(error)
     return figures
@@ -269,8 +269,7 @@ def _robot_figures(robot: RobotResult) -> Figures:
     }
 
 
-def reference_figures(reference: BatchReference) -> Figures:
-    """Figures of the batch MAP under the same names."""
+def _reference_figures(reference: BatchReference) -> Figures:
     errors = reference.errors
     shape = None if errors is None else errors.shape
     return {
@@ -328,12 +327,11 @@ def table_of(
     title: str, first: str, figures: Mapping[str, Figures], shown: Shown, note: str = ""
 ) -> Table:
     """Table with a row for each set of figures."""
-    rows = tuple((name, *cells_of(of_row, shown)) for name, of_row in figures.items())
+    rows = tuple((name, *_cells_of(of_row, shown)) for name, of_row in figures.items())
     return Table(title, (first, *(heading for _, heading, _ in shown)), rows, note)
 
 
-def cells_of(figures: Figures, shown: Shown) -> list[str]:
-    """Row of a table."""
+def _cells_of(figures: Figures, shown: Shown) -> list[str]:
     return [
         "–" if figures.get(name) is None else form.format(figures[name]) for name, _, form in shown
     ]

@@ -45,25 +45,19 @@ DAMPING = 1e-3
 """First damping, relative to the diagonal of the normal equations."""
 
 
-class Solution(NamedTuple):
-    """A state, its cost, and whether it converged."""
-
+class _Solution(NamedTuple):
     state: Values
     cost: float
     at_rest: bool
 
 
-class Whitened(NamedTuple):
-    """Whitened residuals of K terms, Jacobians and state indices."""
-
+class _Whitened(NamedTuple):
     residuals: Float[np.ndarray, "K r"]
     jacobians: Float[np.ndarray, "K r m"]
     at: Int64[np.ndarray, "K m"]
 
 
-class PlainCost:
-    """Cost of a graph's states, without fixed coordinates."""
-
+class _PlainCost:
     def __init__(
         self, graph: Graph, covariance_factor: float, fixed: Bool[np.ndarray, " _"]
     ) -> None:
@@ -102,7 +96,7 @@ class PlainCost:
         whole = sparse.csc_array((np.concatenate(entries), where), shape=(begin, free + 1))
         return whole[:, :free].tocsr()
 
-    def solved(self, state: Values) -> Solution:
+    def solved(self, state: Values) -> _Solution:
         """Minimise from a state.
 
         Steps δ = −(JᵀJ + μ D)⁻¹ Jᵀ r, D = diag JᵀJ, are taken if they lower the cost.
@@ -112,7 +106,7 @@ class PlainCost:
         for _ in range(STEPS):
             step, foreseen = _step(N, damping, gradient)
             if foreseen < SMALL and _step(N, UNDAMPED, gradient)[1] < AT_REST:
-                return Solution(state, cost, at_rest=True)
+                return _Solution(state, cost, at_rest=True)
             tried = state.copy()
             tried[self.free] -= step
             gained = cost - self.of(tried)
@@ -125,13 +119,13 @@ class PlainCost:
                 damping, growth = damping * growth, 2.0 * growth
                 if damping > 1.0 / UNDAMPED:
                     break
-        return Solution(state, cost, at_rest=False)
+        return _Solution(state, cost, at_rest=False)
 
     def _normal(self, state: Values) -> tuple[sparse.csc_array, Values]:
         J = self.jacobian(state)
         return (J.T @ J).tocsc(), J.T @ self.residuals(state)
 
-    def _terms(self, state: Values) -> list[Whitened]:
+    def _terms(self, state: Values) -> list[_Whitened]:
         return [kind.whitened(state) for kind in self._terms_of]
 
 
@@ -146,7 +140,7 @@ class _Submaps(NamedTuple):
     points: Int64[np.ndarray, "K p"]
     poses: int
 
-    def whitened(self, state: Values) -> Whitened:
+    def whitened(self, state: Values) -> _Whitened:
         poses, count = self.poses, self.points.shape[1]
         x = np.concatenate([3 * np.arange(poses), 3 * poses + 2 * np.arange(count - poses)])
         y, heading = x + 1, 3 * np.arange(poses) + 2
@@ -173,7 +167,7 @@ class _Sightings(NamedTuple):
     means: Float[np.ndarray, "K 2"]
     at: Int64[np.ndarray, "K 6"]
 
-    def whitened(self, state: Values) -> Whitened:
+    def whitened(self, state: Values) -> _Whitened:
         pose = state[self.at]
         x, y = pose[:, 3] - pose[:, 0], pose[:, 4] - pose[:, 1]
         distance = np.hypot(x, y)
@@ -193,7 +187,7 @@ class _Priors(NamedTuple):
     means: Float[np.ndarray, "K n"]
     at: Int64[np.ndarray, "K n"]
 
-    def whitened(self, state: Values) -> Whitened:
+    def whitened(self, state: Values) -> _Whitened:
         r = state[self.at] - self.means
         r[:, 2:] = _around(r[:, 2:])
         return _whiten(self, r, np.broadcast_to(np.eye(r.shape[1]), (*r.shape, r.shape[1])))
@@ -239,8 +233,8 @@ def _priors(graph: Graph) -> Iterator[_Priors]:
         yield _Priors(whitening[None], each.mean[None], at[None])
 
 
-def _whiten(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> Whitened:
-    return Whitened((kind.whitening @ r[:, :, None])[:, :, 0], kind.whitening @ J, kind.at)
+def _whiten(kind: _Submaps | _Sightings | _Priors, r: Rows, J: Blocks) -> _Whitened:
+    return _Whitened((kind.whitening @ r[:, :, None])[:, :, 0], kind.whitening @ J, kind.at)
 
 
 def _step(N: sparse.csc_array, damping: float, gradient: Values) -> tuple[Values, float]:
@@ -344,7 +338,7 @@ def compare_minima(
     if settings.joined_ranges:
         raise NotImplementedError("this cost has no central.joined_ranges: leave it out")
     fixed = np.repeat(graph.fixed, np.diff(graph.offset))
-    cost = PlainCost(graph, settings.covariance_factor, fixed)
+    cost = _PlainCost(graph, settings.covariance_factor, fixed)
     ours = cost.of(island.state)
     truth, known = _at_truth(island, landmarks, paths)
     headings = graph.headings[~fixed[graph.headings]]
@@ -365,7 +359,7 @@ def compare_minima(
     spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in pinned_nodes]
     pinned = fixed.copy()
     pinned[np.concatenate([np.zeros(0, np.int64), *spans])] = True
-    given = PlainCost(graph, settings.covariance_factor, pinned)
+    given = _PlainCost(graph, settings.covariance_factor, pinned)
     from_ours = np.where(pinned, truth, island.state)
     rise = min(given.solved(state).cost for state in (truth, from_ours)) - ours
     dof = len(cost.free) - len(given.free)

@@ -145,13 +145,13 @@ def task(panel: Panel, method: Method, seed: int, shots: tuple[int, ...] = ()) -
     if method.particles is not None:
         scenario = with_particles(scenario, method.particles)
     if panel.noise is not None:
-        scenario = with_noise(scenario, *panel.noise)
+        scenario = _with_noise(scenario, *panel.noise)
     label = f"thesis, {panel.name}" if panel.name else "thesis"
     if panel.reading == "stated":
         return curves_task(scenario, None, label, shots=shots)
     as_used = as_coded(scenario) if panel.reading == "coded" else scenario
     late = panel.reading == "coded"
-    return curves_task(with_noise(as_used, 0.0, 0.0), as_used, label, late=late, shots=shots)
+    return curves_task(_with_noise(as_used, 0.0, 0.0), as_used, label, late=late, shots=shots)
 
 
 def _tell_every_step(scenario: Scenario) -> Scenario:
@@ -168,7 +168,9 @@ def as_coded(scenario: Scenario) -> Scenario:
     `get_observations(xtrue(:,i), …)` measures from the pose before the motion.
     """
     coded = with_world(scenario, visible_from_m=0.0, observe_at_start=True)
-    return with_noise(with_robots(coded, "sensor", bearing_sigma=CODED_BEARING_SIGMA), *CODED_NOISE)
+    return _with_noise(
+        with_robots(coded, "sensor", bearing_sigma=CODED_BEARING_SIGMA), *CODED_NOISE
+    )
 
 
 def with_particles(scenario: Scenario, particles: int) -> Scenario:
@@ -178,8 +180,7 @@ def with_particles(scenario: Scenario, particles: int) -> Scenario:
     return msgspec.structs.replace(scenario, central=central)
 
 
-def with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
-    """Set the odometry noise (m, rad) of a step."""
+def _with_noise(scenario: Scenario, forward: float, turn: float) -> Scenario:
     noise = {"forward": MotionNoise(per_s=forward), "turn": MotionNoise(per_s=turn)}
     return with_robots(scenario, "motion", **noise)
 

@@ -50,7 +50,7 @@ if TYPE_CHECKING:  # Matplotlib is slow to import
 STEPS = 500
 
 
-class MapFigure(NamedTuple):
+class _MapFigure(NamedTuple):
     """Maps at some steps of one run, and the error over seeds.
 
     shown: methods with their reading.
@@ -158,9 +158,7 @@ def _draw_paths(axis: "Axes", shot: Figures) -> None:
     as_map(axis)
 
 
-class PathFigure(NamedTuple):
-    """Figure 4.5: paths of one run, beside the errors."""
-
+class _PathFigure(NamedTuple):
     errors: ErrorFigure
 
     def outcome(self, options: Options, results: Results) -> Outcome:
@@ -211,25 +209,25 @@ _ROBOT_1 = (
     "robot 2's start in the appendix. Here, as in figure 4.3 and in the appendix, robot 1 starts "
     "at the right, (80, 40)."
 )
-FIGURE_4_1 = MapFigure(
+FIGURE_4_1 = _MapFigure(
     "Thesis, figure 4.1",
     ((EKF, "stated"), (EKF, "coded"), (OURS, "stated")),
     (STEPS,),
     (_PRINTED, _ROBOT_1),
 )
-FIGURE_4_2 = MapFigure(
+FIGURE_4_2 = _MapFigure(
     "Thesis, figure 4.2",
     ((FASTSLAM, "stated"), (FASTSLAM, "coded"), (OURS, "stated")),
     (STEPS,),
     (_PRINTED, _ROBOT_1),
 )
-FIGURE_4_3 = MapFigure(
+FIGURE_4_3 = _MapFigure(
     "Thesis, figure 4.3",
     ((HYBRID, "stated"), (HYBRID_CODED, "coded"), (OURS, "stated")),
     (STEPS,),
     (_PRINTED,),
 )
-FIGURE_5_1 = MapFigure(
+FIGURE_5_1 = _MapFigure(
     "Thesis, figure 5.1",
     ((MULTI_HYBRID, "stated"), (MULTI_CODED, "coded"), (OUR_TEAM, "stated")),
     (20, 100, 200, STEPS),
@@ -239,4 +237,4 @@ FIGURE_5_1 = MapFigure(
         "counts every measurement again.",
     ),
 )
-FIGURE_4_5 = PathFigure(ERRORS_4_5)
+FIGURE_4_5 = _PathFigure(ERRORS_4_5)

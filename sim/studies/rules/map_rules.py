@@ -67,8 +67,7 @@ class ComparisonCentre(CentralNode):
         raise NotImplementedError
 
 
-def recorded_maps(log: "Recorded", fused: m.FusedMap) -> list[m.MapEstimate]:
-    """The robots' own maps that a recorded map names."""
+def _recorded_maps(log: "Recorded", fused: m.FusedMap) -> list[m.MapEstimate]:
     own = log.of(m.MapEstimate, ch.OWN_MAP)
     by_name = {(x.robot, x.incarnation, x.sequence, x.exchange): x for x in own}
     names = ((x.robot, x.incarnation, x.sequence, fused.exchange) for x in fused.members)
@@ -140,7 +139,7 @@ class NewestMapsCentre(ComparisonCentre):
         starts = {s: start for s, start in firsts.items() if isinstance(start, m.InitialPose)}
         for channel, recorded in ((ch.FUSED_MAP, maps), (ch.FINAL_MAP, finals)):
             for each in recorded:
-                own, final = recorded_maps(log, each), channel is ch.FINAL_MAP
+                own, final = _recorded_maps(log, each), channel is ch.FINAL_MAP
                 fused = self.fuse(own, starts, each.stamp_ns, final=final)
                 if not self.names_inputs:
                     fused = msgspec.structs.replace(fused, reasons=each.reasons)
@@ -169,7 +168,7 @@ class LatestCentre(NewestMapsCentre):
     def publish_newest(self) -> list[Outgoing]:
         """A map at once, if a robot has a newer one."""
         maps = [self._maps[robot] for robot in sorted(self._maps)]
-        named = {(x.robot, x.incarnation): x.sequence for x in maps if is_placed(x, self._starts)}
+        named = {(x.robot, x.incarnation): x.sequence for x in maps if _is_placed(x, self._starts)}
         if all(self._published.get(stream, -1) >= last for stream, last in named.items()):
             return []
         self._published, self._published_ns = named, self.attendance.now_ns
@@ -178,8 +177,8 @@ class LatestCentre(NewestMapsCentre):
 
     def fuse(self, maps: Maps, starts: Starts, now_ns: int, *, final: bool) -> m.FusedMap:
         """Fuse the maps in the team's frame."""
-        placed = [each for each in maps if is_placed(each, starts)]
-        values = {x.robot: value_of(x) for x in placed}
+        placed = [each for each in maps if _is_placed(each, starts)]
+        values = {x.robot: _value_of(x) for x in placed}
         value, refused = fuse_maps(kalman, values, self.config.bounds.coordinate_m)
         away = sorted({x.robot for x in maps} - {x.robot for x in placed})
         reasons = (*(f"{robot}: its start pose is not known" for robot in away), *refused)
@@ -188,7 +187,7 @@ class LatestCentre(NewestMapsCentre):
             self.config,
             _digest(self.config_digest, placed),
             value,
-            members_of(placed),
+            _members_of(placed),
             stamp_ns=max((x.stamp_ns for x in placed), default=0),
             final=final,
             reasons=reasons,
@@ -205,13 +204,13 @@ class AloneCentre(NewestMapsCentre):
             reason = "no fusion, and this estimator makes no map"
         elif len(self.robots) != 1:
             reason = "no fusion: each robot has its own map"
-        value = NO_LANDMARKS if reason else value_of(maps[0])
+        value = NO_LANDMARKS if reason else _value_of(maps[0])
         self.landmarks = len(value.ids)
         return fused_message(
             self.config,
             _digest(self.config_digest, maps),
             value,
-            members_of(maps),
+            _members_of(maps),
             stamp_ns=max((x.stamp_ns for x in maps), default=now_ns),
             final=True,
             joint=not maps or maps[0].joint,
@@ -219,8 +218,7 @@ class AloneCentre(NewestMapsCentre):
         )
 
 
-def is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
-    """Whether the initial pose of a map's stream is known."""
+def _is_placed(estimate: m.MapEstimate, starts: Mapping[Stream, m.InitialPose]) -> bool:
     start = starts.get((estimate.robot, estimate.incarnation))
     return start is not None and bool(start.pose)
 
@@ -229,8 +227,7 @@ def _name(estimate: m.MapEstimate) -> tuple[int, int]:
     return estimate.incarnation, estimate.sequence
 
 
-def members_of(maps: Sequence[m.MapEstimate]) -> tuple[m.VersionEntry, ...]:
-    """Names of these maps."""
+def _members_of(maps: Sequence[m.MapEstimate]) -> tuple[m.VersionEntry, ...]:
     return tuple(
         m.VersionEntry(robot=x.robot, incarnation=x.incarnation, sequence=x.sequence) for x in maps
     )
@@ -240,8 +237,7 @@ def _digest(settings: bytes, maps: Sequence[m.MapEstimate]) -> bytes:
     return digest_of(settings, *(x.ids + x.means + x.covariance for x in maps))
 
 
-def value_of(estimate: m.MapEstimate) -> LandmarkGaussian:
-    """The landmarks of a robot's own map."""
+def _value_of(estimate: m.MapEstimate) -> LandmarkGaussian:
     return LandmarkGaussian(
         *translate.landmarks_of(estimate), translate.landmark_covariance_of(estimate)
     )
@@ -298,7 +294,7 @@ class RoundsCentre(ComparisonCentre):
     ) -> Iterator[Outgoing]:
         """Recompute the rounds in order from their recorded maps."""
         for fused in sorted(maps, key=lambda each: each.exchange):
-            yield self._fuse(fused.exchange, recorded_maps(log, fused))
+            yield self._fuse(fused.exchange, _recorded_maps(log, fused))
         for fused in finals:
             yield Outgoing(ch.FINAL_MAP, "", self._final(fused.stamp_ns))
 
@@ -319,7 +315,7 @@ class RoundsCentre(ComparisonCentre):
         return msgspec.structs.replace(last, final=True, reasons=reasons)
 
     def _fuse(self, number: int, maps: Sequence[m.MapEstimate]) -> Outgoing:
-        values = {x.robot: value_of(x) for x in maps}
+        values = {x.robot: _value_of(x) for x in maps}
         value, refused = fuse_maps(
             RULES[self.config.fusion], values, self.config.bounds.coordinate_m
         )
@@ -327,7 +323,7 @@ class RoundsCentre(ComparisonCentre):
         previous = b"" if self._fused is None else self._fused.digest
         stamp_ns = max(x.stamp_ns for x in maps)
         self._fused = self._message(
-            number, stamp_ns, members_of(maps), value, payload + previous, refused
+            number, stamp_ns, _members_of(maps), value, payload + previous, refused
         )
         return Outgoing(ch.FUSED_MAP, "", self._fused)
 
