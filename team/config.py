@@ -119,16 +119,13 @@ class MotionModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         speeds = self.calibrated_speed
         if speeds is not None and speeds[0] > speeds[1]:
             raise ValueError("calibrated_speed is [least, most]: the least comes first")
-        on_wheels = self.kind == "differential-drive"
-        if on_wheels and self.wheel_base is None:
-            raise ValueError(
-                "differential-drive needs wheel_base, the distance of its wheels in metres"
-            )
-        if self.kind == "ackermann" and self.wheel_base is None:
-            raise ValueError("ackermann needs wheel_base, the distance of its axles in metres")
+        distances = {"differential-drive": "wheels", "ackermann": "axles"}
+        if self.kind in distances and self.wheel_base is None:
+            of = distances[self.kind]
+            raise ValueError(f"{self.kind} needs wheel_base, the distance of its {of} in metres")
         if self.kind != "ackermann" and (self.wheel_offset or self.steering_offset):
             raise ValueError(f"wheel_offset and steering_offset are a car's, not of {self.kind}")
-        if not on_wheels and (self.left_wheel or self.right_wheel):
+        if self.kind != "differential-drive" and (self.left_wheel or self.right_wheel):
             raise ValueError(
                 f"left_wheel and right_wheel are noises of differential-drive, not of {self.kind}"
             )

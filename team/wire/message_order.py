@@ -6,6 +6,8 @@ ones. Each order is total.
 
 from collections.abc import Sequence
 
+import msgspec
+
 from teamslam.team.wire import messages as m
 
 SetOrder = tuple[int, int, int, tuple[tuple[str, int, int], ...]]
@@ -47,28 +49,22 @@ def merge_progress(new: m.Progress, known: m.Progress | None) -> m.Progress:
         return new
     if new.incarnation < known.incarnation:
         return known
-    return m.Progress(
-        stamp_ns=max(new.stamp_ns, known.stamp_ns),
-        node=new.node,
-        robot=new.robot,
-        incarnation=new.incarnation,
-        measurements=max(new.measurements, known.measurements),
-        submaps=max(new.submaps, known.submaps),
-    )
+    counts = ("stamp_ns", "measurements", "submaps")
+    larger = {count: max(getattr(new, count), getattr(known, count)) for count in counts}
+    return msgspec.structs.replace(new, **larger)
 
 
 def merge_ends(new: m.End, known: m.End | None) -> m.End:
     """Return the end with the larger counter of each stream; notes of `new`."""
     if known is None:
         return new
-    streams = {each.robot: each for each in known.streams}
-    for each in new.streams:
-        before = streams.get(each.robot)
-        if before is None or (each.incarnation, each.measurements) > (
-            before.incarnation,
-            before.measurements,
-        ):
-            streams[each.robot] = each
+
+    def counter(end: m.StreamEnd) -> tuple[int, int]:
+        return end.incarnation, end.measurements
+
+    streams: dict[str, m.StreamEnd] = {}
+    for each in (*known.streams, *new.streams):
+        streams[each.robot] = max(streams.get(each.robot, each), each, key=counter)
     ordered = tuple(streams[robot] for robot in sorted(streams))
     return m.End(stamp_ns=max(new.stamp_ns, known.stamp_ns), streams=ordered, notes=new.notes)
 

@@ -227,7 +227,7 @@ def test_a_sample_of_another_key_is_dropped_and_has_not_arrived(endpoint, caplog
             return "asked for" in caplog.text
 
         wait_until(requested)
-        source._counters[key] = 2
+        source._published[key] = 2
         source.publish(Outgoing(c.SUBMAP, "alpha", submap(2)))
         wait_until(lambda: bool(arrived.extend(sink.receive(0.02)) or len(arrived) >= 2))
         assert counters(arrived, key) == [0, 2]

@@ -64,7 +64,6 @@ class ZenohBus:
         self._sheds = frozenset(channel.name for channel in sheds)
         self._queue: SimpleQueue[Work | None] = SimpleQueue()
         self._publishers: dict[str, Publisher] = {}
-        self._counters: dict[str, int] = {}
         self._requested: set[tuple[str, str]] = set()
         self._open_queries: set[tuple[str, str]] = set()
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
@@ -135,8 +134,7 @@ class ZenohBus:
 
     def publish(self, out: Outgoing) -> int:
         """Encode and publish; after ten seconds of a busy link Zenoh drops it and connects anew."""
-        counter = self._counters.get(out.key, 0)
-        self._counters[out.key] = counter + 1
+        counter = self._published.get(out.key, 0)
         stamp_ns = out.message.stamp_ns
         payload = encoded(out.message)
         self.publish_raw(Sample(out.key, payload, stamp_ns, time.time_ns(), counter))
@@ -150,10 +148,8 @@ class ZenohBus:
                 f"{sample.key}: {len(sample.payload)} bytes, {LARGEST_PAYLOAD} at most; "
                 "split the map or send blocks instead of the joint covariance"
             )
-        attachment = pack(
-            self._prefix + sample.key,
-            Attachment(sample.stamp_ns, sample.wall_ns, sample.counter),
-        )
+        stamps = Attachment(sample.stamp_ns, sample.wall_ns, sample.counter)
+        attachment = pack(self._prefix + sample.key, stamps)
         try:
             publisher = self._publishers.get(sample.key)
             if publisher is None:
@@ -161,9 +157,8 @@ class ZenohBus:
                     self._session, self._prefix, sample.key
                 )
             publisher.put(sample.payload, attachment=attachment)
-            self._published[sample.key] = max(
-                self._published.get(sample.key, 0), sample.counter + 1
-            )
+            before = self._published.get(sample.key, 0)
+            self._published[sample.key] = max(before, sample.counter + 1)
             self._newest_ns = max(self._newest_ns, sample.stamp_ns)
             if self.tap is not None:
                 self.tap([sample])
