@@ -98,6 +98,16 @@ def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:
     return m.End(stamp_ns=stamp_ns, streams=tuple(streams))
 
 
+def verdict(
+    first: m.LocalLandmark, second: m.LocalLandmark, *, same: bool, withdrawn: bool = False
+) -> m.Verdict:
+    judgement = m.Judgement(first=first, second=second, same=same)
+    return m.Verdict(
+        stamp_ns=0, robot=first.robot, judgement=judgement, by="operator", reason="",
+        withdrawn=withdrawn,
+    )  # fmt: skip
+
+
 def version(**last: int) -> tuple[m.VersionEntry, ...]:
     """Version vector of a set: last sequence of each robot's first incarnation."""
     return tuple(

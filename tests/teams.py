@@ -131,12 +131,8 @@ def driven(
     out = [o for measurement in measurements for o in node.handle(measurement)]
     if end:
         last = measurements[-1]
-        ends = (
-            m.StreamEnd(
-                robot=node.robot, incarnation=last.incarnation, measurements=last.number + 1
-            ),
-        )
-        out += node.handle(m.End(stamp_ns=last.stamp_ns, streams=ends))
+        count = {node.robot: last.number + 1}
+        out += node.handle(build.end(last.stamp_ns, last.incarnation, **count))
     return out
 
 

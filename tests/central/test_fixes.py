@@ -7,8 +7,8 @@ import pytest
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.export.take_home import take_home
-from teamslam.central.desk.verification.centre import recompute_centre, recorded_map
-from teamslam.central.desk.verification.recorded import Recorded, identity
+from teamslam.central.desk.verification.centre import recorded_map
+from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.survey import datum_of
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
@@ -18,12 +18,11 @@ from teamslam.team.datum import Datum
 from teamslam.team.estimation.plausibility import sighting_beyond
 from teamslam.team.saved_map import datum_in, map_figures
 from teamslam.team.translate import sighting_of
-from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
-from teamslam.team.wire.codec import encoded
 from tests.central.test_survey import errors
 from tests.scenarios import final_only, with_front_ends, with_robots, with_world
+from tests.sim.reruns import check_recomputed
 
 SIGMA_M = 0.3
 ANTENNA = (0.8, -0.5)
@@ -114,13 +113,7 @@ def test_a_fix_beyond_the_bounds_is_refused(changed, why):
 
 
 def test_maps_with_fixes_are_recomputed_from_the_log():
-    recorded = Recorded()
-    recorded.take_all(day(3, live=True)[0])
-    computed = recompute_centre(recorded)
-    maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
-    assert maps
-    for each in maps:
-        assert encoded(computed[identity(each.sample.key, each.message)]) == each.sample.payload
+    check_recomputed(day(3, live=True)[0])
 
 
 def test_a_map_of_fixes_keeps_the_datum_where_its_frame_is_the_datums_plane():

@@ -6,8 +6,6 @@ import pytest
 
 from teamslam.central.config import CentralConfig, SurveyedLandmark
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.desk.verification.centre import recompute_centre
-from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
@@ -15,12 +13,11 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.core import unpacked
 from teamslam.team.saved_map import SavedMapError, map_name
-from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import opened
-from teamslam.team.wire.codec import encoded
 from tests.scenarios import final_only, with_world
+from tests.sim.reruns import check_recomputed
 
 SIGMA_M = 0.05
 UTM = (399_000.0, 5_756_000.0)
@@ -137,12 +134,7 @@ def test_coordinates_of_a_national_grid_lose_no_accuracy():
 
 
 def test_every_map_is_computed_again_from_the_log():
-    recorded = Recorded()
-    recorded.take_all(live_day())
-    computed = recompute_centre(recorded)
-    maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
-    for each in maps:
-        assert encoded(computed[identity(each.sample.key, each.message)]) == each.sample.payload
+    check_recomputed(live_day())
 
 
 @pytest.mark.parametrize(

@@ -153,13 +153,12 @@ def test_no_pose_claims_the_teams_frame_and_is_in_another_whatever_the_order_of_
 
 
 def end_of(team: Team) -> m.End:
-    ends = []
+    ends = {}
     for name, node in team.robots.items():
         while team.coming[name]:
             team.measure(name)
-        end = m.StreamEnd(robot=name, incarnation=1, measurements=node.next_measurement)
-        ends.append(end)
-    message = m.End(stamp_ns=0, streams=tuple(ends))
+        ends[name] = node.next_measurement
+    message = build.end(**ends)
     for node in team.robots.values():
         team.take(node.handle(message))
     for name in team.robots:

@@ -51,17 +51,10 @@ def _rule() -> MapPublisher:
     return rule
 
 
-def _verdict(same: bool = False, withdrawn: bool = False) -> m.Verdict:
+def _verdict(withdrawn: bool = False) -> m.Verdict:
     first = m.LocalLandmark(robot="r1", incarnation=1, sequence=3, local=0)
     second = m.LocalLandmark(robot="r1", incarnation=1, sequence=4, local=0)
-    return m.Verdict(
-        stamp_ns=0,
-        robot="r1",
-        judgement=m.Judgement(first=first, second=second, same=same),
-        by="operator",
-        reason="",
-        withdrawn=withdrawn,
-    )
+    return build.verdict(first, second, same=False, withdrawn=withdrawn)
 
 
 def _final(rule: MapPublisher) -> m.FusedMap:

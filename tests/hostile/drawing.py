@@ -216,8 +216,7 @@ def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
             submaps=count,
         )
         out += [said, done]
-    streams = tuple(m.StreamEnd(robot=robot, incarnation=1, measurements=1000) for robot in ROBOTS)
-    return [*out, m.End(stamp_ns=10**12, streams=streams)]
+    return [*out, build.end(10**12, **dict.fromkeys(ROBOTS, 1000))]
 
 
 def centre_session(
@@ -307,10 +306,7 @@ def hostile_stream(rng: np.random.Generator, robot: str, count: int) -> Iterator
                 now_ns = end_ns
         if rng.random() < 0.05:
             yield prior(rng, robot)
-    yield m.End(
-        stamp_ns=now_ns,
-        streams=(m.StreamEnd(robot=robot, incarnation=1, measurements=counter + 1),),
-    )
+    yield build.end(now_ns, **{robot: counter + 1})
 
 
 def prior(rng: np.random.Generator, robot: str) -> m.Prior:

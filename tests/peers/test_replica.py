@@ -168,17 +168,7 @@ def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn():
         m.LocalLandmark(robot=robot, incarnation=1, sequence=0, local=3) for robot in ROBOTS
     )
     told = [
-        member(
-            ch.VERDICT,
-            m.Verdict(
-                stamp_ns=0,
-                robot="r1",
-                judgement=m.Judgement(first=first, second=second, same=same),
-                by="operator",
-                reason="",
-                withdrawn=withdrawn,
-            ),
-        )
+        member(ch.VERDICT, build.verdict(first, second, same=same, withdrawn=withdrawn))
         for same, withdrawn in ((True, False), (False, False), (True, True))
     ]
     one, other = replica_of(*told), replica_of(*reversed(told), told[0])

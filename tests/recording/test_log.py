@@ -33,11 +33,6 @@ def stream(count: int) -> list[Sample]:
     ]
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "log.mcap"
-
-
 def test_every_recorded_message_comes_back_sound(path):
     log = recorded(path, [sample for _, _, sample in recorded_examples()])
     assert [opened(one)[2] for one in log.samples()] == [x for _, x, _ in recorded_examples()]

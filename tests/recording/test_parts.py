@@ -32,11 +32,6 @@ from tests.recording.test_shell import FINAL, POSE, Team, logged
 from tests.support import odometry, received, submap, wait_until
 
 
-@pytest.fixture
-def path(tmp_path):
-    return tmp_path / "log.mcap"
-
-
 def killed_part(path: Path, samples: list[Sample]) -> None:
     recorder = Recorder(path, "t", {"scenario": "s"})
     recorder.write(samples)

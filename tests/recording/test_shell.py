@@ -28,11 +28,6 @@ FINAL = example(m.FusedMap)
 
 
 @pytest.fixture
-def path(tmp_path):
-    return tmp_path / "log.mcap"
-
-
-@pytest.fixture
 def endpoint():
     with router() as bound:
         yield bound

@@ -51,11 +51,6 @@ def found(log: Log) -> list[str]:
 
 
 @pytest.fixture
-def path(tmp_path):
-    return tmp_path / "log.mcap"
-
-
-@pytest.fixture
 def whole(path):
     samples = sorted([*drive("alpha", 6), *drive("bravo", 6)], key=lambda s: s.stamp_ns)
     return recorded(path, samples, seed="7")

@@ -11,6 +11,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing, Sample
 from teamslam.team.wire.codec import decoded, encoded
+from tests import build
 from tests.support import odometry
 from tests.teams import config, published, stream, submaps_of
 
@@ -112,9 +113,7 @@ def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source
     class Ending(Source):
         def answer(self, request: bytes) -> list[bytes]:
             if not self.asked:  # the world ends while the forged ones are consumed
-                ended = m.StreamEnd(robot="r1", incarnation=1, measurements=1)
-                end = m.End(stamp_ns=0, streams=(ended,))
-                self.bus.publish(Outgoing(ch.END, "", end))
+                self.bus.publish(Outgoing(ch.END, "", build.end(r1=1)))
             return super().answer(request)
 
     network = MemoryNetwork()
@@ -152,9 +151,8 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
         source.begins(1)
         measured = msgspec.structs.replace(odometry(1, "r1"), incarnation=1)
         source.bus.publish(Outgoing(ch.ODOMETRY, "r1", measured))
-        for counts in ((1, 1), (1, 2), (1, 9), (7, 3)):
-            ended = m.StreamEnd(robot="r1", incarnation=counts[0], measurements=counts[1])
-            end = m.End(stamp_ns=0, streams=(ended,))
+        for incarnation, count in ((1, 1), (1, 2), (1, 9), (7, 3)):
+            end = build.end(incarnation=incarnation, r1=count)
             source.bus.publish(Outgoing(ch.END, "", end))
 
     shell = lived(network, MemoryBus(network), act)
@@ -173,8 +171,7 @@ def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
         source.begins(1)
         head = m.StreamHead(stamp_ns=0, robot="r1", incarnation=1, measurements=5000, state=state)
         source.bus.publish(Outgoing(ch.HEAD, "r1", head))
-        ended = m.StreamEnd(robot="r1", incarnation=1, measurements=2)
-        source.bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=0, streams=(ended,))))
+        source.bus.publish(Outgoing(ch.END, "", build.end(r1=2)))
 
     lived(network, MemoryBus(network), act, waits_s=0.3)
     (said,) = viewer.receive()

@@ -23,10 +23,7 @@ from tests.teams import config, driven, of, published, stream
 
 STREAM = stream("r1", 12, off_ns=300_000_000)
 MEASUREMENTS = published(STREAM)
-END = m.End(
-    stamp_ns=12_000_000_000,
-    streams=(m.StreamEnd(robot="r1", incarnation=1, measurements=len(MEASUREMENTS)),),
-)
+END = build.end(12_000_000_000, r1=len(MEASUREMENTS))
 CENTRE = build.liveliness(node="central")
 
 
@@ -244,8 +241,7 @@ def test_a_new_incarnation_closes_the_old_one_under_its_own_name():
     ]
     second[0] = build.initial_pose(stamp_ns=second[0].stamp_ns, incarnation=2)
     out += [o for r in second for o in node.handle(r)]
-    ends = (m.StreamEnd(robot="r1", incarnation=2, measurements=len(second)),)
-    out += node.handle(m.End(stamp_ns=0, streams=ends))
+    out += node.handle(build.end(incarnation=2, r1=len(second)))
     submaps = of(out, ch.SUBMAP)
     names = [(s.incarnation, s.sequence) for s in submaps]
     assert names == [(1, 0), (1, 1), *((2, k) for k in range(len(names) - 2))]

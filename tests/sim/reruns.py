@@ -5,6 +5,8 @@ from pathlib import Path
 
 import msgspec
 
+from teamslam.central.desk.verification.centre import recompute_centre
+from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -60,3 +62,14 @@ def said(team: Team) -> list[Sample]:
         for key, sent in team.sent.items()
         for counter, message in enumerate(sent)
     ]
+
+
+def check_recomputed(samples: Sequence[Sample]) -> None:
+    """Check that a log's maps are recomputed to the same bytes."""
+    recorded = Recorded()
+    recorded.take_all(samples)
+    computed = recompute_centre(recorded)
+    maps = [*recorded.outputs_of(ch.FUSED_MAP), *recorded.outputs_of(ch.FINAL_MAP)]
+    assert maps
+    for each in maps:
+        assert encoded(computed[identity(each.sample.key, each.message)]) == each.sample.payload

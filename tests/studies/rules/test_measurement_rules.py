@@ -14,7 +14,6 @@ from teamslam.team import translate
 from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.randomness import generator
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
@@ -35,13 +34,7 @@ def announced(name):
 
 
 def end(measurements=MEASUREMENTS):
-    return m.End(
-        stamp_ns=0,
-        streams=tuple(
-            m.StreamEnd(robot=n, incarnation=r[-1].incarnation, measurements=len(r))
-            for n, r in measurements.items()
-        ),
-    )
+    return build.end(**{name: len(each) for name, each in measurements.items()})
 
 
 def heard(fusion, messages, robots=("r1", "r2")):
