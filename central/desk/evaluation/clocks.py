@@ -83,21 +83,16 @@ class Timed:
             return
         self.ends_ns.append(message.stamp_ns)
         self.durations_ns.append(message.duration_ns)
-        self.motions.extend(_speeds(message))
         self.steered.append(isinstance(message, m.Steering))
-
-
-def _speeds(message: m.AnyOdometry) -> tuple[float, float, float]:
-    match message:
-        case m.Odometry():
-            return message.forward, 0.0, message.yaw_rate
-        case m.Steering():
-            return message.wheel_speed, message.steering, 0.0
-        case m.Increment():
-            per_s = 1.0 / max(1e-9 * message.duration_ns, 1e-9)
-            increment = floats(message.increment, "increment").astype(np.float64)
-            forward, left, turn = (per_s * moved(increment, None).twist).tolist()
-            return forward, left, turn
+        match message:
+            case m.Odometry():
+                self.motions.extend((message.forward, 0.0, message.yaw_rate))
+            case m.Steering():
+                self.motions.extend((message.wheel_speed, message.steering, 0.0))
+            case m.Increment():
+                per_s = 1.0 / max(1e-9 * message.duration_ns, 1e-9)
+                increment = floats(message.increment, "increment").astype(np.float64)
+                self.motions.extend((per_s * moved(increment, None).twist).tolist())
 
 
 @dataclass(frozen=True)
@@ -145,10 +140,9 @@ def separate_times_warning(spans_ns: Mapping[str, tuple[int, int]]) -> str | Non
     until_ns = 0
     for robot in sorted(spans_ns, key=lambda each: spans_ns[each]):
         first_ns, last_ns = spans_ns[robot]
-        if groups and first_ns <= until_ns:
-            groups[-1].append(robot)
-        else:
-            groups.append([robot])
+        if not groups or first_ns > until_ns:
+            groups.append([])
+        groups[-1].append(robot)
         until_ns = max(until_ns, last_ns)
     if len(groups) < 2:
         return None
@@ -177,8 +171,6 @@ def lateness(timed: Timed, config: RobotConfig) -> Late | None:
     Gauss–Newton under Huber's loss; σ is divided by the slope of the step in τ, which noise of the
     derivative reduces.
     """
-    if not timed.ends_ns or not timed.ids:
-        return None
     with np.errstate(all="ignore"):
         pairs = _pairs_of(timed, config)
         if pairs is None:
@@ -193,7 +185,7 @@ def lateness(timed: Timed, config: RobotConfig) -> Late | None:
                 break
         else:
             return None
-        (before, _), (after, _) = pairs.step(late_ns - STEP_NS), pairs.step(late_ns + STEP_NS)
+        before, after = (pairs.step(late_ns + by)[0] for by in (-STEP_NS, STEP_NS))
         slope = min((before - after) / (2e-9 * STEP_NS), 1.0)
         return Late(1e-9 * late_ns, sigma / slope) if slope > LEAST_SLOPE else None
 
@@ -247,11 +239,8 @@ class Pairs:
     @property
     def gaps(self) -> Float[np.ndarray, " k"]:
         """Distance of b_j from its place by the odometry/max(range, NEAR_M)."""
-        gaps = self.b_j - self._again(0)
-        found: Float[np.ndarray, " k"] = np.hypot(*gaps.T) / np.maximum(
-            np.hypot(*self.b_j.T), NEAR_M
-        )
-        return found
+        gaps, ranges = np.hypot(*(self.b_j - self._again(0)).T), np.hypot(*self.b_j.T)
+        return np.asarray(gaps / np.maximum(ranges, NEAR_M))
 
     def _motion(self, late_ns: int) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, " k"]]:
         one, two = self.path.at(self.t_i - late_ns), self.path.at(self.t_j - late_ns)
@@ -263,6 +252,8 @@ class Pairs:
 
 
 def _pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
+    if not timed.ends_ns or not timed.ids:
+        return None
     path = _dead_reckoning(timed, config)
     stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
     order = np.lexsort((stamps, names))
@@ -390,8 +381,6 @@ def mirrored_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis
 def _gains(timed: Timed, config: RobotConfig) -> Float[np.ndarray, " n"]:
     """χ² that a reflection removes from each stretch of time."""
     none = np.zeros(0)
-    if not timed.ends_ns or not timed.ids:
-        return none
     seen = np.array(timed.seen).reshape(-1, 2) * (1.0, -1.0)
     with np.errstate(all="ignore"):
         own = _pairs_of(timed, config)

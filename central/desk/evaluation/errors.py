@@ -135,10 +135,8 @@ def map_errors(
     motion = rigid_alignment(truth, means)
     return MapErrors(
         count=count,
-        rmse_m=rms(np.hypot(difference[:, 0], difference[:, 1])),
-        aligned_rmse_m=None
-        if motion is None
-        else distance_rmse(transform_points(motion, means), truth),
+        rmse_m=distance_rmse(means, truth),
+        aligned_rmse_m=_moved_rmse(motion, means, truth),
         truth_from_map=motion,
         nees_per_dof=nees(difference.ravel(), covariance) / (2 * count),
         band=chi2_interval(2 * count, BAND, 1),
@@ -206,6 +204,14 @@ def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> f
     """RMS distance between corresponding rows [m]."""
     difference = a - b
     return rms(np.hypot(difference[:, 0], difference[:, 1]))
+
+
+def _moved_rmse(
+    motion: Float[np.ndarray, "3"] | None,
+    points: Float[np.ndarray, "n 2"],
+    truth: Float[np.ndarray, "n 2"],
+) -> float | None:
+    return None if motion is None else distance_rmse(transform_points(motion, points), truth)
 
 
 def interpolate_truth(
@@ -310,9 +316,7 @@ def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
         len(estimate),
         distance_rmse(estimate[:, :2], true[:, :2]),
         rms(turned),
-        None
-        if motion is None
-        else distance_rmse(transform_points(motion, estimate[:, :2]), true[:, :2]),
+        _moved_rmse(motion, estimate[:, :2], true[:, :2]),
         None if motion is None else rms(on_circle(turned + motion[2])),
         rms(np.hypot(relative[:, 0], relative[:, 1])) if len(relative) else None,
         rms(relative[:, 2]) if len(relative) else None,

@@ -129,7 +129,7 @@ class ViewerNode:
         self._detector = EventDetector()
         self._now_ns: int | None = None
         self._turn = 0
-        self._reach = (math.inf, math.inf, -math.inf, -math.inf)
+        self._low, self._high = np.full(2, math.inf), np.full(2, -math.inf)
         self.finished = False
 
     @property
@@ -139,7 +139,7 @@ class ViewerNode:
 
     def handle(self, channel: Channel, message: m.Message) -> list[Shown]:
         """Process a message of a channel; return the due views."""
-        out = [_logged(event) for event in self._detector.take(message, self.now_ns)]
+        out = [_log_line(event) for event in self._detector.take(message, self.now_ns)]
         self._take(channel, message)
         reached = self._reached_ns()
         if reached is None:
@@ -155,13 +155,11 @@ class ViewerNode:
         return out
 
     def _reached_ns(self) -> int | None:
-        marks = {n: r.reached_ns for n, r in self._robots.items() if r.reached_ns is not None}
-        if not marks:
+        there = [(r, r.reached_ns) for r in self._robots.values() if r.reached_ns is not None]
+        if not there:
             return None
-        newest = max(marks.values())
-        at_work = [
-            at for n, at in marks.items() if not (self._robots[n].lost or self._robots[n].done)
-        ]
+        newest = max(at for _, at in there)
+        at_work = (at for robot, at in there if not (robot.lost or robot.done))
         return max(min(at_work, default=newest), newest - LAG_NS)
 
     def _take(self, channel: Channel, message: m.Message) -> None:
@@ -225,18 +223,13 @@ class ViewerNode:
                 robot.reached_ns = max(robot.reached_ns, message.stamp_ns)
 
     def _extend(self, points: Float[np.ndarray, "n 2"]) -> None:
-        if len(points):
-            low, high = points.min(axis=0), points.max(axis=0)
-            left, bottom, right, top = self._reach
-            self._reach = (
-                min(left, low[0]), min(bottom, low[1]), max(right, high[0]), max(top, high[1]),
-            )  # fmt: skip
+        self._low = np.minimum(self._low, points.min(axis=0, initial=math.inf))
+        self._high = np.maximum(self._high, points.max(axis=0, initial=-math.inf))
 
     def _size_m(self) -> float:
         """Drawn size of a robot: 1, 2 or 5 times a power of ten."""
-        left, bottom, right, top = self._reach
-        across = max(right - left, top - bottom) / _MARKS_ACROSS
-        if not across > 0.0 or not math.isfinite(across):
+        across = float((self._high - self._low).max()) / _MARKS_ACROSS
+        if not 0.0 < across < math.inf:
             return 1.0
         power = 10.0 ** math.floor(math.log10(across))
         return power * next((step for step in (5.0, 2.0) if across >= step * power), 1.0)
@@ -349,7 +342,7 @@ class ViewerNode:
         )
 
 
-def _logged(event: Event) -> Shown:
+def _log_line(event: Event) -> Shown:
     warns = event.kind in ("lost", "refused", "warning", "withdrawn")
     line = fox.log_line(event.stamp_ns, event.node, event.text, warns=warns)
     return Shown(views.LOG.key(), event.stamp_ns, line)
