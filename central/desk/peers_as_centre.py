@@ -6,7 +6,7 @@ peers agree. A present centre takes precedence.
 
 import hashlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from contextlib import suppress
 from typing import TypeVar
 
@@ -215,11 +215,3 @@ def _decoded(sample: Sample, kind: type[M]) -> M | None:
 
 def _with_message(sample: Sample, key: str, message: m.Message) -> Sample:
     return msgspec.structs.replace(sample, key=key, payload=encoded(message))
-
-
-def with_centre_messages(centre: PeersAsCentre, samples: Iterable[Sample]) -> Iterator[Sample]:
-    """Yield samples, each followed by its counterpart of a centre."""
-    for sample in samples:
-        yield sample
-        if (counterpart := centre.of(sample)) is not None:
-            yield counterpart

@@ -2,13 +2,14 @@
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
-from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre, with_centre_messages
+from teamslam.central.desk.peers_as_centre import LISTENS, PeersAsCentre
 from teamslam.central.desk.view.node import ViewerNode
 from teamslam.team.containment import Boundary
 from teamslam.team.end_query import EndQuery
@@ -24,41 +25,41 @@ VIEWED = frozenset((*ViewerNode.listens, ch.ALIVE))
 """Channels of a viewer."""
 
 
-def for_viewer(
-    sample: Sample, channels: Collection[ch.Channel] = VIEWED
-) -> tuple[ch.Channel, m.Message] | None:
-    """Channel and message of a sample of these channels."""
-    if ch.row_of(sample.key) not in channels:
-        return None
-    sound = try_open(sample)
-    return None if sound is None else (sound[0], sound[2])
-
-
 class Viewing:
-    """Viewer node over samples."""
+    """Viewer node over samples, of peers also in a centre's name."""
 
-    def __init__(self) -> None:
+    def __init__(self, peers: Collection[str] | None = None) -> None:
         self.node = ViewerNode()
-        self._counters: dict[str, int] = {}
+        self._centre = PeersAsCentre(peers)
+        self._counters = Counter[str]()
 
-    def take(self, sample: Sample, input_: tuple[ch.Channel, m.Message] | None) -> list[Sample]:
-        """Views of a sample's message, with their own counters."""
+    def inputs(
+        self, samples: Iterable[Sample], channels: Collection[ch.Channel] = VIEWED
+    ) -> Iterator[tuple[Sample, ch.Channel, m.Message]]:
+        """Yield the valid samples of these channels, decoded."""
+        for sample in samples:
+            for each in filter(None, (sample, self._centre.of(sample))):
+                if ch.row_of(each.key) in channels and (sound := try_open(each)) is not None:
+                    yield each, sound[0], sound[2]
+
+    def draw(self, sample: Sample, channel: ch.Channel, message: m.Message) -> list[Sample]:
+        """Views of a message, with their own counters."""
         out = []
-        for shown in [] if input_ is None else self.node.handle(*input_):
-            counter = self._counters.get(shown.key, 0)
-            self._counters[shown.key] = counter + 1
+        for shown in self.node.handle(channel, message):
+            counter = self._counters[shown.key]
+            self._counters[shown.key] += 1
             out.append(Sample(shown.key, shown.payload, shown.stamp_ns, sample.wall_ns, counter))
         return out
 
 
 def with_views(samples: Iterable[Sample]) -> Iterator[Sample]:
     """Yield samples, each followed by its views, without recorded ones."""
-    viewing, centre = Viewing(), PeersAsCentre()
+    viewing = Viewing()
     for sample in samples:
         if ch.VIEW.owner(sample.key) is None:
             yield sample
-            for each in with_centre_messages(centre, [sample]):
-                yield from viewing.take(each, for_viewer(each))
+            for each in viewing.inputs([sample]):
+                yield from viewing.draw(*each)
 
 
 class Drawn(NamedTuple):
@@ -105,8 +106,7 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
     peers: robots whose agreed map is the final one. Raises FaultyRunError at the end if the map
     lacks a robot or a message could not be drawn.
     """
-    viewing = Viewing()
-    centre = PeersAsCentre(peers)
+    viewing = Viewing(peers)
     for channel in (*viewing.node.listens, *LISTENS):
         bus.subscribe(channel)
     bus.watch_alive()
@@ -123,14 +123,14 @@ def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> 
             figures = {"messages": float(published)}
             status = Status(stamp_ns=0, node=NODE, state="viewing", figures=figures)
             bus.publish(Outgoing(ch.STATUS, NODE, status))
-        for sample in with_centre_messages(centre, (*bus.receive(WAIT_S), *end.find_missed())):
+        samples = (*bus.receive(WAIT_S), *end.find_missed())
+        for sample, channel, message in viewing.inputs(samples):
             if ch.ALIVE.owner(sample.key) == NODE:
                 continue
+            if isinstance(message, FusedMap) and message.final:
+                final = message
             try:
-                input_ = for_viewer(sample)
-                if input_ is not None and isinstance(input_[1], FusedMap) and input_[1].final:
-                    final = input_[1]
-                views = viewing.take(sample, input_)
+                views = viewing.draw(sample, channel, message)
             except Exception as error:  # omit a message that cannot be drawn
                 bus.publish(boundary.note(error, sample, ""))
                 continue

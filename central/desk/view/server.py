@@ -27,12 +27,11 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from teamslam.central.desk.peers_as_centre import PeersAsCentre, with_centre_messages
-from teamslam.central.desk.view.export import VIEWED, Viewing, for_viewer
+from teamslam.central.desk.view.export import VIEWED, Viewing
 from teamslam.central.desk.view.page_frames import CHANNELS, PageFrames
 from teamslam.team.recording.reader import LogError
 from teamslam.team.recording.tail import Tail
-from teamslam.team.wire.bus import BusError, Sample
+from teamslam.team.wire.bus import BusError
 
 if TYPE_CHECKING:
     from teamslam.central.desk.view.foxglove_server import FoxgloveServer
@@ -87,7 +86,6 @@ class Feed:
     ended: bool = False
     _page: PageFrames = field(default_factory=PageFrames)
     _viewing: Viewing = field(default_factory=Viewing)
-    _centre: PeersAsCentre = field(default_factory=PeersAsCentre)
     _greeted: bool = False
 
     def read_more(self, *, growing: bool) -> bool:
@@ -104,24 +102,18 @@ class Feed:
             self._page.hello(log.team, log.metadata, self.tail.path.name, live=growing)
         for sample in samples:
             self._page.count(sample)
-            for each in with_centre_messages(self._centre, [sample]):
-                self._take(each)
+            for each, channel, message in self._viewing.inputs([sample], CHANNELS):
+                self._page.take(channel, message)
+                views = self._viewing.draw(each, channel, message) if channel in VIEWED else []
+                for view in views:
+                    if self.foxglove is not None:
+                        self.foxglove.publish(view)
         if samples:
             self.frames += self._page.flush(self._viewing.node.now_ns)
         elif self.tail.ended or not growing:
             self.frames += self._page.end(self._faults())
             self.ended = True
         return bool(samples)
-
-    def _take(self, sample: Sample) -> None:
-        input_ = for_viewer(sample, CHANNELS)
-        if input_ is None:
-            return
-        self._page.take(*input_)
-        if input_[0] in VIEWED:
-            for view in self._viewing.take(sample, input_):
-                if self.foxglove is not None:
-                    self.foxglove.publish(view)
 
     def _faults(self) -> list[str]:
         damaged = (
