@@ -5,7 +5,7 @@ landmark is right, with one label in two landmarks missed, with two labels in on
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -86,10 +86,11 @@ def association_result(log: Collected) -> AssociationResult | None:
     labels = _labels(log)
     if all(label == UNKNOWN for label in labels.values()):
         return None
+    final = log.newest(ch.FINAL_MAP, m.FusedMap)
     detections = list(_detections(log, labels))
     places = [place for _, place, _ in detections]
     # Without submaps, a place has the number of the estimator's own map.
-    identity = _identities(log) or {place: place[3] for place in places if place is not None}
+    identity = _identities(final) or {place: place[3] for place in places if place is not None}
     label = np.array([each[0] for each in detections], np.int64)
     windows = [each[2] for each in detections]
     local = _numbered(places)
@@ -99,7 +100,6 @@ def association_result(log: Collected) -> AssociationResult | None:
     several = len({place[:3] for place in identity}) > 1
     named = [number for number in label_of if label_of[number] != UNKNOWN]
     confirmed = [number for number in named if len(submaps[number]) > 1 or not several]
-    final = log.newest(ch.FINAL_MAP, m.FusedMap)
     decisions = () if final is None else final.decisions
     in_map = {*confirmed} if final is None else {*ids(final.ids, "ids").tolist()}
     right, wrong = _merges(label, places, identity)
@@ -151,15 +151,17 @@ def _detections(
             yield label, (*window, number) if number >= UNNAMED else None, window
 
 
-def _identities(log: Collected) -> dict[Place, int]:
-    final = log.newest(ch.FINAL_MAP, m.FusedMap)
-    found: dict[Place, int] = {}
-    for each in () if final is None else final.memberships:
-        columns = (each.sequences, each.locals, each.identities)
-        rows = zip(*(ids(column, "members").tolist() for column in columns), strict=True)
-        for sequence, local, identity in rows:
-            found[each.robot, each.incarnation, sequence, UNNAMED + local] = identity
-    return found
+def members_of(fused: m.FusedMap) -> Iterator[tuple[Place, int]]:
+    """Submap landmarks in a map, by number less UNNAMED, each with its number there."""
+    for of in fused.memberships:
+        columns = [ids(each, "members") for each in (of.sequences, of.locals, of.identities)]
+        for sequence, local, identity in np.transpose(columns).tolist():
+            yield (of.robot, of.incarnation, sequence, local), identity
+
+
+def _identities(final: m.FusedMap | None) -> dict[Place, int]:
+    members = () if final is None else members_of(final)
+    return {(r, i, k, UNNAMED + local): identity for (r, i, k, local), identity in members}
 
 
 def _numbered(values: Sequence[object]) -> Int64[np.ndarray, " n"]:

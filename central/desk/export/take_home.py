@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path as FilePath
-from typing import Any, TypeAlias
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from teamslam.central.desk.evaluation.association import Place, members_of
 from teamslam.central.desk.evaluation.errors import Path, associate_truth
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult
@@ -37,8 +38,6 @@ STATE = "state"
 """Further column of a map that was compared with saved ones: moved, gone, new, unchanged."""
 CLASSES = ("class", "class_probability")
 """Further columns of a map whose landmarks have classes."""
-Member: TypeAlias = tuple[str, int, int, int]
-"""(robot, incarnation, sequence, number) of a submap's landmark."""
 PATH_COLUMNS = (
     "t_s", "x_m", "y_m", "theta_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_xt_m_rad",
     "cov_yt_m_rad", "cov_tt_rad2",
@@ -71,13 +70,13 @@ def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
     """
     config = None if "central" not in found.configured else found.central_config()[0]
     names = () if config is None else config.classes
-    rows: dict[Member, Float[np.ndarray, " C"]] = {}
+    rows: dict[Place, Float[np.ndarray, " C"]] = {}
     for submap in found.of(m.Submap, ch.SUBMAP):
         own = [each for each, _ in _detections(submap)]
         rows |= zip(own, translate.classes_of(submap, len(own)), strict=True)
     most = max((len(each) for each in rows.values()), default=0)
     sums: dict[int, Float[np.ndarray, " C"]] = {}
-    for member, identity in _members(found):
+    for member, identity in _final_members(found):
         row = rows.get(member, np.zeros(0))
         if len(row):
             full = np.full(most, row.min())
@@ -106,20 +105,16 @@ def _measurement_counts(found: Recorded) -> Mapping[int, int]:
                 named = ids(message.ids, "ids")
                 counts.update(named[named < UNNAMED].tolist())
     seen = dict(chain.from_iterable(map(_detections, found.of(m.Submap, ch.SUBMAP))))
-    for member, identity in _members(found):
+    for member, identity in _final_members(found):
         counts[identity] += seen.get(member, 0)
     return counts
 
 
-def _members(found: Recorded) -> Iterator[tuple[Member, int]]:
-    for fused in found.of(m.FusedMap, ch.FINAL_MAP)[-1:]:
-        for of in fused.memberships:
-            columns = [ids(each, "members") for each in (of.sequences, of.locals, of.identities)]
-            for sequence, local, identity in np.transpose(columns).tolist():
-                yield (of.robot, of.incarnation, sequence, local), identity
+def _final_members(found: Recorded) -> Iterator[tuple[Place, int]]:
+    return chain.from_iterable(map(members_of, found.of(m.FusedMap, ch.FINAL_MAP)[-1:]))
 
 
-def _detections(submap: m.Submap) -> Iterator[tuple[Member, int]]:
+def _detections(submap: m.Submap) -> Iterator[tuple[Place, int]]:
     numbers = ids(submap.ids, "ids")
     unnamed = (numbers[numbers >= UNNAMED] - UNNAMED).tolist()
     for local, count in zip(unnamed, ids(submap.counts, "counts").tolist(), strict=True):

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teamslam.central.desk.drawing import ROBOT_COLOURS
+from teamslam.central.desk.evaluation.association import members_of
 from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
 from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment
@@ -352,22 +353,20 @@ def sets_of(fused: m.FusedMap) -> dict[int, tuple[int, list[str]]]:
     A member such as `r1/1/12/7` is robot, incarnation, submap, local landmark.
     """
     found: dict[int, tuple[set[tuple[str, int, int]], list[str]]] = {}
-    for table in fused.memberships:
-        named = (ids(each, "members") for each in (table.sequences, table.locals, table.identities))
-        columns = *(each.tolist() for each in named), table.steps
-        figures = floats(table.figures, "figures").reshape(-1, 3).tolist()
-        for sequence, local, identity, step, (llr, rival, sd) in zip(
-            *columns, figures, strict=True
-        ):
-            submaps, words = found.setdefault(identity, (set(), []))
-            submaps.add((table.robot, table.incarnation, sequence))
-            name = f"{table.robot}/{table.incarnation}/{sequence}/{local}"
-            if not 0 < step < len(STEPS):
-                words.append(name)
-                continue
-            against = f", its best rival {rival:.1f}" if rival > -1e299 else ", no rival"
-            words.append(
-                f"{name}: {STEPS[step]}, log-likelihood ratio {min(llr, 1e6):.1f}{against}, "
-                f"sd {sd:.2f} m"
-            )
+    steps = (step for table in fused.memberships for step in table.steps)
+    tables = (floats(table.figures, "figures").reshape(-1, 3) for table in fused.memberships)
+    figures = (row for table in tables for row in table.tolist())
+    rows = zip(members_of(fused), steps, figures, strict=True)
+    for ((robot, incarnation, sequence, local), identity), step, (llr, rival, sd) in rows:
+        submaps, words = found.setdefault(identity, (set(), []))
+        submaps.add((robot, incarnation, sequence))
+        name = f"{robot}/{incarnation}/{sequence}/{local}"
+        if not 0 < step < len(STEPS):
+            words.append(name)
+            continue
+        against = f", its best rival {rival:.1f}" if rival > -1e299 else ", no rival"
+        words.append(
+            f"{name}: {STEPS[step]}, log-likelihood ratio {min(llr, 1e6):.1f}{against}, "
+            f"sd {sd:.2f} m"
+        )
     return {number: (len(submaps), words[:SHOWN]) for number, (submaps, words) in found.items()}
