@@ -1,13 +1,15 @@
 """State of each robot in the final map."""
 
 from collections.abc import Collection, Mapping
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from teamslam.central.desk.evaluation.log import Collected
 from teamslam.central.desk.names import in_order, not_joined
 from teamslam.team.config import MAP
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+
+if TYPE_CHECKING:  # a launch gives orders without NumPy
+    from teamslam.central.desk.evaluation.log import Collected
 
 State = Literal["joined", "not joined", "withdrawn", "lost", "alone"]
 """joined: in the team's map. not joined: its map, if any, is separate. withdrawn: by an order or a
@@ -27,7 +29,7 @@ class RobotState(NamedTuple):
 
 
 def robot_states(
-    log: Collected, fused: m.FusedMap | None, robots: Collection[str]
+    log: "Collected", fused: m.FusedMap | None, robots: Collection[str]
 ) -> dict[str, RobotState]:
     """State of every robot, and of saved maps as `map-<name>`."""
     if fused is None:
