@@ -14,7 +14,7 @@ import numpy as np
 
 from teamslam.team import core, translate
 from teamslam.team.config import Exchange, RobotConfig
-from teamslam.team.door import another_time
+from teamslam.team.door import EARLY_NS, LATE_NS
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pipeline import DUE, HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
@@ -91,7 +91,6 @@ class Mapper:
         self._began_ns = start.stamp_ns
         self.now_ns, self.passed_ns = max(self.now_ns, start.stamp_ns), start.stamp_ns - 1
         self._restart(start.incarnation, initial)
-        self.note_input(start.number)
 
     def _restart(self, incarnation: int, initial: InitialPose) -> None:
         self.ledger = Ledger(self.used, on_disposition=self._on_disposition)
@@ -128,6 +127,8 @@ class Mapper:
     def finish(self) -> bool:
         """End the incarnation; return whether that closed a window."""
         self.passed_ns = self.now_ns
+        if self._window:
+            self._slam.last_measurement = self._window[-1].number
         closed, uncovered = self._slam.finish()
         if closed is not None:
             self._close(closed)
@@ -141,7 +142,6 @@ class Mapper:
     def take(self, measurement: m.Measurement) -> bool:
         """Take the next measurement; return whether it closed a window."""
         self._taking = measurement
-        self.note_input(measurement.number)
         if m.is_odometry(measurement):
             return self.drive(measurement)
         self.account(measurement, self._observe(measurement))
@@ -152,7 +152,7 @@ class Mapper:
 
         False after a clock leap beyond the stamps that receivers take.
         """
-        if another_time(stamp_ns, self._began_ns) is not None:
+        if not -EARLY_NS <= stamp_ns - self._began_ns <= LATE_NS:
             return False
         if stamp_ns > self.now_ns:
             self.now_ns = stamp_ns
@@ -169,18 +169,18 @@ class Mapper:
     def drive(self, measurement: m.AnyOdometry) -> bool:
         """Take an odometry interval; return whether it closed the window."""
         outcome = self._drive(measurement)
-        if not outcome:  # most intervals
-            self.account(measurement, None)
-            return False
         rejected = BY_CORE[outcome % DUE]
-        before_ns, closed = self._slam.last_keyframe_ns, None
-        if outcome >= DUE:
-            closed = self._slam.advance()
+        if outcome < DUE:  # most intervals
+            self.account(measurement, rejected)
+            return False
+        slam, before_ns = self._slam, self._slam.last_keyframe_ns
+        slam.last_measurement = measurement.number
+        closed = slam.advance()
         if closed is not None:
             self._close(closed, measurement, rejected)
             return True
         self.account(measurement, rejected)
-        keyframe_ns = self._slam.last_keyframe_ns
+        keyframe_ns = slam.last_keyframe_ns
         if keyframe_ns != before_ns and keyframe_ns is not None:
             self.out += self.poses.publish(keyframe_ns, self)
         return False
@@ -315,7 +315,6 @@ class Mapper:
         """Compute the open window again."""
         self._reopen_window()
         for measurement in self._window:
-            self.note_input(measurement.number)
             if isinstance(measurement, m.AnyOdometry):
                 if self._drive(measurement) >= DUE:
                     self._slam.advance()
@@ -325,9 +324,7 @@ class Mapper:
     def _reopen_window(self) -> None:
         last = self.submaps.last
         self._slam = HybridSlam(self.config, self.writer.incarnation)
-        if last is None:
-            self.note_input(0)
-        else:
+        if last is not None:
             self._slam.resume(last.sequence, last.last_measurement, last.stamp_ns)
 
     # The estimator.
@@ -336,10 +333,6 @@ class Mapper:
     def judge(self) -> core.StreamJudge:
         """Checks the stream's times."""
         return self._slam.segmenter.judge
-
-    def note_input(self, number: int) -> None:
-        """Note a measurement, even a rejected one, as the open window's input."""
-        self._slam.last_measurement = number
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
         """Take a scan, or return the reason to reject it."""

@@ -34,7 +34,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.downs_joined import final_maps_only
 from teamslam.sim.studies.experiments.true_minimum import final_fold
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.team.estimation.hybrid_slam import open_window
+from teamslam.team.estimation.hybrid_slam import pipeline
 from teamslam.team.estimation.map_joining.marginals import landmark_map
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -79,7 +79,7 @@ def variants(scenario: Scenario, *, is_aligned: bool) -> Iterator[tuple[str, Fig
     samples = log_of(scenario)
     yield "default", of(samples, is_robust=True, has_biases=True)
     yield "squares", of(samples, is_robust=False, has_biases=True)
-    with mock.patch.object(open_window, "OUTLIER_SHARE", NO_OUTLIERS):
+    with mock.patch.object(pipeline, "OUTLIER_SHARE", NO_OUTLIERS):
         samples = log_of(scenario)
     yield "no gate", of(samples, is_robust=False, has_biases=True)
     yield "no states", of(samples, is_robust=False, has_biases=False)

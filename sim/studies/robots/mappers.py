@@ -237,9 +237,6 @@ class StreamMapper(ExchangingMapper):
         """Checks the stream's times."""
         return self._judge
 
-    def note_input(self, number: int) -> None:
-        """Ignore inputs of windows: there are none."""
-
     def repeat_window(self) -> None:
         """Repeat nothing: there is no window."""
 

@@ -28,7 +28,7 @@ from teamslam.team.shapes import Float, Int64
 Paths = Float[np.ndarray, "K M 3"]
 FEW = 10.0
 """Effective number of lines of descent below which the scatter of paths is no estimate of their
-uncertainty, as of particles (`open_window.DEPLETED`).
+uncertainty, as of particles (`pipeline.DEPLETED`).
 """
 
 

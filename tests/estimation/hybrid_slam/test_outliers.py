@@ -10,7 +10,7 @@ from teamslam.sim.scenarios.scenario import Scenario, load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
+from teamslam.team.estimation.hybrid_slam.pipeline import OpenWindow
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
 from tests.scenarios import final_only, with_front_ends, with_world

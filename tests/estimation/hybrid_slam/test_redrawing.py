@@ -7,9 +7,8 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, AssociationSettings, FrontEnd, RobotConfig, Sensor
 from teamslam.team.core import Keyframe, Scan, TimedScan
-from teamslam.team.estimation.hybrid_slam import open_window
-from teamslam.team.estimation.hybrid_slam.open_window import OpenWindow
-from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
+from teamslam.team.estimation.hybrid_slam import pipeline
+from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam, OpenWindow
 from teamslam.team.estimation.hybrid_slam.window import gaussian
 from teamslam.team.estimation.se2 import between, compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
@@ -43,7 +42,7 @@ def nees_of_window(seed, sequence):
 
 def test_depleted_windows_are_taken_again_with_more_particles(monkeypatch):
     with_more = [nees_of_window(*each) for each in WINDOWS.items()]
-    monkeypatch.setattr(open_window, "DEPLETED", 0.0)
+    monkeypatch.setattr(pipeline, "DEPLETED", 0.0)
     as_they_were = [nees_of_window(*each) for each in WINDOWS.items()]
     assert sum(with_more) < 0.5 * sum(as_they_were)
 
@@ -107,7 +106,7 @@ def differences(keyframes: list[Keyframe]) -> list[float]:
 def test_a_window_says_the_same_whatever_its_random_numbers(monkeypatch):
     keyframes, _ = drive(4)
     assert max(differences(keyframes)) < 0.5
-    monkeypatch.setattr(open_window, "redraw_paths", lambda *_: None)
+    monkeypatch.setattr(pipeline, "redraw_paths", lambda *_: None)
     assert max(differences(keyframes)) > 2.0
 
 
