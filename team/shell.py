@@ -17,29 +17,10 @@ import msgspec
 from teamslam.team.config import MAP
 from teamslam.team.containment import Boundary, reply_of
 from teamslam.team.end_query import EndQuery
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample, read_reply
-from teamslam.team.wire.channels import (
-    ALIVE,
-    FAULT,
-    FINAL_MAP,
-    MEASUREMENTS,
-    QUERIES,
-    RECORDED,
-    STATUS,
-    Channel,
-)
 from teamslam.team.wire.codec import WireError, decoded
-from teamslam.team.wire.messages import (
-    FusedMap,
-    Liveliness,
-    Measurement,
-    MeasurementsRequest,
-    Message,
-    Status,
-    SubmapsRequest,
-    Tally,
-    tag_of,
-)
 from teamslam.team.wire.request_times import RequestTimes
 
 FAILED_S = 10.0
@@ -102,10 +83,10 @@ class Node(Protocol):
     def begin(self) -> list[Outgoing]:
         """Return the node's first messages."""
 
-    def handle(self, message: Message) -> list[Outgoing]:
+    def handle(self, message: m.Message) -> list[Outgoing]:
         """Handle one message; return the answers."""
 
-    def status(self) -> Status:
+    def status(self) -> m.Status:
         """Return the node's status."""
 
 
@@ -113,7 +94,7 @@ class FaultyRunError(RuntimeError):
     """Messages were set aside in this run, or its final map lacks a robot."""
 
 
-def judge(boundary: Boundary, final: FusedMap | None) -> None:
+def judge(boundary: Boundary, final: m.FusedMap | None) -> None:
     """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
     warnings = boundary.warnings if boundary.faults else ()
     lacks = "" if final is None else describe_missing(final)
@@ -121,7 +102,7 @@ def judge(boundary: Boundary, final: FusedMap | None) -> None:
         raise FaultyRunError("; ".join((*warnings, *([lacks] if lacks else ()))))
 
 
-def describe_missing(final: FusedMap) -> str:
+def describe_missing(final: m.FusedMap) -> str:
     """Describe the robots that the final map lacks; empty: none."""
     found = []
     robots = [each for each in final.withdrawn if not each.startswith(MAP)]
@@ -142,7 +123,7 @@ class Shell:
         node: Node,
         name: str,
         stop: threading.Event,
-        ends: Collection[Channel] = (FINAL_MAP,),
+        ends: Collection[ch.Channel] = (ch.FINAL_MAP,),
     ) -> None:
         self.bus = bus
         self.node = node
@@ -160,7 +141,7 @@ class Shell:
         """Handler of the samples that end the team and that this node has missed."""
         self._recorder_is_there: bool | None = None
         self._recorder_since = 0.0
-        self._totals: Tally | None = None
+        self._totals: m.Tally | None = None
         self._lacking: dict[str, int] | None = None
         self._missing_least = 0
         self._messages = 0
@@ -208,15 +189,15 @@ class Shell:
         """Publish messages in order, and send requests; a failure is a fault."""
         for outgoing in out:
             try:
-                if outgoing.channel in QUERIES:
+                if outgoing.channel in ch.QUERIES:
                     self.bus.request(*outgoing)
                     continue
                 self._bytes += self.bus.publish(outgoing)
                 self._messages += 1
             except Exception as error:
                 sample = Sample(outgoing.key, b"", outgoing.message.stamp_ns, 0, -1)
-                fault = self.boundary.note(error, sample, tag_of(type(outgoing.message)))
-                if outgoing.channel is not FAULT:
+                fault = self.boundary.note(error, sample, m.tag_of(type(outgoing.message)))
+                if outgoing.channel is not ch.FAULT:
                     self.publish([fault])
 
     def take(self, samples: Iterable[Sample]) -> None:
@@ -227,7 +208,7 @@ class Shell:
             if self._is_running:
                 self.report()
 
-    def take_replies(self, channel: Channel, name: str, replies: Iterable[bytes]) -> None:
+    def take_replies(self, channel: ch.Channel, name: str, replies: Iterable[bytes]) -> None:
         """Handle the replies to a query as `take` does."""
         for reply in replies:
             try:
@@ -237,7 +218,7 @@ class Shell:
             else:
                 self.publish(self.boundary.take(self.node, sample))
 
-    def answer(self, channel: Channel, name: str, answer: Answer) -> None:
+    def answer(self, channel: ch.Channel, name: str, answer: Answer) -> None:
         """Answer queries; an exception is a fault, which the sender is told."""
 
         def contained(request: bytes) -> list[bytes]:
@@ -247,7 +228,7 @@ class Shell:
                 raise  # an unsound request: the asker's
             except Exception as error:
                 sample = Sample(channel.key(name), request, 0, 0, -1)
-                self.publish([self.boundary.note(error, sample, tag_of(channel.message))])
+                self.publish([self.boundary.note(error, sample, m.tag_of(channel.message))])
                 raise ValueError(f"the answer failed: {type(error).__name__}") from error
 
         self.bus.answer(channel, name, contained)
@@ -273,19 +254,19 @@ class Shell:
             self._note_recorder(sample)
 
     def _note_recorder(self, sample: Sample) -> None:
-        if sample.key == ALIVE.key(RECORDER):
+        if sample.key == ch.ALIVE.key(RECORDER):
             with suppress(WireError):
-                there = decoded(sample.payload, Liveliness).alive
+                there = decoded(sample.payload, m.Liveliness).alive
                 came_back = there and self._recorder_is_there is False
                 if came_back or not there:
                     self._recorder_since = time.monotonic()
                     self._lacking = None
                 self._recorder_is_there = there
-        elif sample.key == RECORDED.key(self._name) and self._totals is not None:
+        elif sample.key == ch.RECORDED.key(self._name) and self._totals is not None:
             with suppress(WireError):
-                self._note_recorded(decoded(sample.payload, Tally), self._totals)
+                self._note_recorded(decoded(sample.payload, m.Tally), self._totals)
 
-    def _note_recorded(self, has: Tally, totals: Tally) -> None:
+    def _note_recorded(self, has: m.Tally, totals: m.Tally) -> None:
         if has.since_ns != totals.since_ns:
             return
         published = dict(zip(totals.keys, totals.counts, strict=True))
@@ -304,7 +285,7 @@ class Shell:
         """
         if self._recorder_is_there is None:
             return
-        self.bus.subscribe(RECORDED, self._name)
+        self.bus.subscribe(ch.RECORDED, self._name)
         self._totals = self.bus.publish_totals()
         now = time.monotonic()
         away = not self._recorder_is_there
@@ -324,7 +305,7 @@ class Shell:
             samples = self.bus.receive(WAIT_S)
             self.note(samples)
             if take is not None:
-                take([sample for sample in samples if sample.key != RECORDED.key(self._name)])
+                take([sample for sample in samples if sample.key != ch.RECORDED.key(self._name)])
 
     def _is_recorded(self, lacks: Callable[[], bool]) -> bool:
         if not self._recorder_is_there or lacks():
@@ -341,7 +322,7 @@ class Shell:
         missing, keys = sum(self._lacking.values()), list(self._lacking)
         return f"it lacks {missing} messages on {len(keys)} keys, as {keys[0]}"
 
-    def end(self, final: FusedMap | None) -> None:
+    def end(self, final: m.FusedMap | None) -> None:
         """Raise FaultyRunError if any message was set aside, or the final map lacks a robot."""
         judge(self.boundary, final)
 
@@ -355,7 +336,7 @@ class Shell:
     def _publish_status(self) -> None:
         status = self.contain("status", self.node.status)
         if status is None:
-            status = Status(
+            status = m.Status(
                 stamp_ns=0,
                 node=self._name,
                 state="unknown",
@@ -381,7 +362,7 @@ class Shell:
         if self.bus.dropped:
             rates["dropped_samples"] = float(self.bus.dropped)
         status = msgspec.structs.replace(status, figures=status.figures | rates, warnings=warnings)
-        self.bus.publish(Outgoing(STATUS, self._name, status))
+        self.bus.publish(Outgoing(ch.STATUS, self._name, status))
 
     def run(self, duty: Callable[[], None] = lambda: None) -> None:
         """Run until the end: receive, handle, publish, run `duty`, publish the status."""
@@ -396,7 +377,7 @@ class Shell:
 
 ASK_TIMEOUT_S = 10.0
 """Longest time [s] for an answer; the request is repeated later."""
-R = TypeVar("R", MeasurementsRequest, SubmapsRequest)
+R = TypeVar("R", m.MeasurementsRequest, m.SubmapsRequest)
 
 
 def select_due(requests: Iterable[R], times: RequestTimes[tuple[str, int]]) -> list[R]:
@@ -410,13 +391,13 @@ class MissingMeasurements:
     """Request missing measurements; confirm: called with each before the node handles it."""
 
     def __init__(
-        self, shell: Shell, confirm: Callable[[Measurement], None] = lambda _: None
+        self, shell: Shell, confirm: Callable[[m.Measurement], None] = lambda _: None
     ) -> None:
         self._shell = shell
         self._confirm = confirm
         self._times: RequestTimes[tuple[str, int]] = RequestTimes()
 
-    def look(self, requests: Sequence[MeasurementsRequest]) -> None:
+    def look(self, requests: Sequence[m.MeasurementsRequest]) -> None:
         """Send the requests that are due."""
         for each in select_due(requests, self._times):
             _LOG.warning(
@@ -428,17 +409,17 @@ class MissingMeasurements:
             )
             self.ask(each)
 
-    def ask(self, request: MeasurementsRequest) -> int:
+    def ask(self, request: m.MeasurementsRequest) -> int:
         """Send one request; return the number of measurements received."""
         try:
-            replies = self._shell.bus.ask(MEASUREMENTS, request.robot, request, ASK_TIMEOUT_S)
+            replies = self._shell.bus.ask(ch.MEASUREMENTS, request.robot, request, ASK_TIMEOUT_S)
         except BusError as error:
             _LOG.warning("%s", error)
             return 0
         for reply in replies:
             with suppress(WireError):  # the door counts it
-                self._confirm(reply_of(reply, Measurement))
-        self._shell.take_replies(MEASUREMENTS, request.robot, replies)
+                self._confirm(reply_of(reply, m.Measurement))
+        self._shell.take_replies(ch.MEASUREMENTS, request.robot, replies)
         return len(replies)
 
 
