@@ -85,7 +85,7 @@ class TeamAttendance:
 
     has_received: whether all messages announced in a `Done` are processed. processed: number of
     processed submaps of a stream. now_ns: the newest team time. world_end: the world's last
-    counters. ends: the announced ends. ordered: an operator has ordered the live team to end.
+    counters. ordered: an operator has ordered the live team to end.
     """
 
     names: InitVar[Sequence[str]]
@@ -231,9 +231,7 @@ class TeamAttendance:
         return None
 
     def is_settled(self, name: str) -> bool:
-        """Whether the final map need not wait for this robot: complete, given up, or withdrawn and
-        offline. It waits for a lost robot, whose return must not change the map.
-        """
+        """Whether the final map need not wait for this robot. It waits for a lost one."""
         return self._is_excused(name) or self._never_measured(name) or self.is_complete(name)
 
     @property
@@ -274,9 +272,8 @@ class TeamAttendance:
         )
 
     def _accept_confirmed_end(self) -> bool:
-        """Accept an announced end and the robots' `Done` messages that confirm each other.
-
-        Without keys a stranger can announce a later end and a `Done`.
+        """Accept an end that the robots' `Done` messages confirm; a stranger may announce a later
+        one.
         """
         for end, unconfirmed in self.ends.items():
             if not unconfirmed.is_none(end.streams, self._is_open):

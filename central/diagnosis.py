@@ -216,7 +216,6 @@ def _is_start(found: Hypothesis | m.Diagnosis) -> bool:
 
 
 def _start_remedy(fold: Fold, found: Hypothesis) -> str:
-    """Describe the remedy for a wrong initial pose; of two it names the other one."""
     own = fold.main.graph.streams
     others = {each for each in fold.starts if each in own and each[0] != found.subject}
     if len(others) != 1:
@@ -226,10 +225,7 @@ def _start_remedy(fold: Fold, found: Hypothesis) -> str:
 
 
 def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
-    """Whether an apparent jump has less evidence than an error of the robot's submaps.
-
-    A late clock bends windows where the robot turns, beyond their sensitivities.
-    """
+    """Whether an apparent jump has less evidence than a shared error, as of a late clock."""
     if jump.cause != CARRIED_OFF:
         return False
     evidence = jump.evidence / jump.dof
@@ -249,8 +245,8 @@ def _shared_errors(
     """Find errors that differ from the robot's configuration beyond doubt.
 
     Their standard deviation is the larger of the stated one, times the root of a covariance scale
-    above 1, and that from the scatter of the submaps (Student's t), which slowly changing errors
-    show. A large error's standard deviation grows by the error of its sensitivities.
+    above 1, and that from the scatter of the submaps (Student's t); a large error's grows by the
+    error of its sensitivities.
     """
     for found in biases:
         (robot, _), bias, value, stated = found

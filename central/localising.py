@@ -63,8 +63,10 @@ def in_saved_map(fold: Fold) -> Fold:
 
 
 def seeks_saved_map(fold: Fold, stream: Stream) -> bool:
-    """Whether a robot is to be placed by a saved map's landmarks: no robot of the main island has a
-    start or is in a saved map, and this one is outside it or alone in it.
+    """Whether a robot is to be placed by a saved map's landmarks.
+
+    No robot of the main island has a start or is in a saved map, and this one is alone in it or
+    outside.
     """
     there = [each for each, key in fold.home.items() if key == fold.main_key]
     if any(each in fold.starts or is_map(each) for each in there):

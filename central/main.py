@@ -57,10 +57,8 @@ _LOG = logging.getLogger("teamslam")
 
 
 class CentralShell:
-    """The centre's process.
-
-    patience_s: a robot lost for this long is given up; None: only by an order. admit: accept robots
-    that the scenario does not name.
+    """The centre's process; patience_s: a robot lost for this long is given up; None: only by an
+    order.
     """
 
     def __init__(
@@ -192,9 +190,7 @@ class CentralShell:
         return tuple(warnings)
 
     def _request_orders(self) -> None:
-        """Query the router for operators' orders, which may have come while this process was
-        offline.
-        """
+        """Query the router for operators' orders that this process may have missed."""
         now = time.monotonic()
         if now >= self._orders_due:
             self._orders_due = now + ORDERS_S

@@ -81,7 +81,7 @@ class MapPublisher:
         return self._has_news(closed_ns)
 
     def _publish_closed(self, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        """Publish the map of the closed ticks, or of the whole set if that has more submaps: a
+        """Publish the map of the closed ticks; of the whole set if that has more submaps: a
         teammate's new submap helps at once, and no map has less than the one before it.
         """
         ticks_end_ns = closed_ns

@@ -38,7 +38,7 @@ class CentralNode:
     """The node of the centre: call `begin`, then `handle` for every message, until `finished`.
 
     inputs: the channels of the set. announcement: the configuration, whose digest maps carry.
-    admit: accept robots that the scenario does not name. warnings: the newest last.
+    admit: accept robots that the scenario does not name.
     """
 
     inputs: ClassVar[tuple[ch.Channel, ...]] = (
@@ -142,8 +142,8 @@ class CentralNode:
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
         """Continue after an exception in `handle`, and give the sender the credit.
 
-        A member that could not be filed counts as refused. The newest map replaces a final one that
-        raises, provisional and with the reason.
+        A member that could not be filed counts as refused. The newest map replaces a failed final
+        one.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)

@@ -129,7 +129,6 @@ def _classes(fold: Fold, unnamed: Sequence[int]) -> bytes:
 
 
 def _own_errors(island: Island) -> dict[RobotBias, int]:
-    """Return the nodes of the lasting errors of today's robots, each of the last stream."""
     found: dict[RobotBias, int] = {}
     for (stream, bias), node in sorted(
         island.graph.biases.items(), key=lambda each: (whole_of(each[0][0]), each[0])

@@ -70,10 +70,10 @@ class SentPriors:
         shown: Sequence[int],
         alone: Collection[Stream] = (),
     ) -> list[Stream]:
-        """Select the streams to which to send a prior of this fold.
+        """Select the streams to which to send a prior of this fold; alone: those that get landmarks
+        alone.
 
-        alone: those that get landmarks alone. Others outside the team's map are selected once, to
-        withdraw theirs.
+        Others outside the team's map are selected once, to withdraw theirs.
         """
         inside = [each for each in streams if each in alone or in_main_island(fold, each)]
         out = self._withdrawn({*streams} - {*inside})

@@ -61,8 +61,8 @@ class RecordedFields(NamedTuple):
 class SubmapFold:
     """Fold the stored set tick by tick and make the messages of its maps.
 
-    convicts: False for a recorded set, which withdraws no further robot. warnings: the newest last.
-    landmarks, finding, diagnosis, reasons: of the newest map. not_folded: number of refused inputs.
+    convicts: False for a recorded set. landmarks, finding, diagnosis, reasons: of the newest map.
+    not_folded: number of refused inputs.
     """
 
     def __init__(
@@ -142,11 +142,9 @@ class SubmapFold:
         return save_map(fold, fused, name, before, firsts, datum)
 
     def _digest_first(self, stream: Stream) -> bytes:
-        """Digest the first submap of a stream, which names it in saved maps."""
         return digest_of(encoded(self.store.chains[stream][0]))
 
     def _file_members(self) -> None:
-        """Add the store's new members; folded ticks are folded again."""
         store, ticks = self.store, self._ticks
         for robot in sorted(store.withdrawals):
             ticks.withdraw_robot(robot)
@@ -313,8 +311,8 @@ class SubmapFold:
         shown: Sequence[int],
         recorded: RecordedFields | None,
     ) -> list[Outgoing]:
-        """Make the priors that have news, or the recorded ones: from the team's fold, or the
-        robot's own while robots contradict each other.
+        """Make the priors with news, or the recorded ones; while robots contradict each other, of
+        their own fold.
         """
         out = []
         streams = self._latest_streams(fused) if recorded is None else sorted(recorded.priors_of)

@@ -97,8 +97,8 @@ def join_settings(config: CentralConfig) -> JoinSettings:
 class TickFold:
     """Folds a set of submaps tick by tick.
 
-    limits: sizes for condensing; None: never. inputs: those of another fold, read only. convicts:
-    whether the fold withdraws robots. undecided: robots that contradict each other.
+    limits: sizes for condensing; None: never. convicts: whether the fold withdraws robots.
+    undecided: robots that contradict each other.
     """
 
     def __init__(
@@ -339,10 +339,8 @@ class TickFold:
         return other
 
     def fold_apart(self, fold: Fold, *, ahead: bool) -> Mapping[str, Fold]:
-        """Fold each robot's submaps by themselves where joining them contradicts: where a robot's
-        disagreement exceeds the limit, and as many times its disagreement alone.
-
-        A fold in another frame than the team's is empty. ahead: with the ticks that are not closed.
+        """Fold each robot's submaps by themselves where a robot's disagreement exceeds the limit,
+        and as many times its disagreement alone; a fold in another frame than the team's is empty.
         """
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:

@@ -140,9 +140,8 @@ def _most_of_newest(
 
 
 def _share(chi2: float, dof: float, chance: float) -> float | None:
-    """Joint cost per degree of freedom, at most 1 where chance explains it; None with too few.
-
-    One without degrees of freedom, or infinite, has overflown: a disagreement.
+    """Joint cost per degree of freedom, at most 1 where chance explains it; None with too few. One
+    without, or infinite, has overflown.
     """
     if not math.isfinite(chi2) or not math.isfinite(dof):
         return math.inf
@@ -164,9 +163,10 @@ def find_suspects(agreement: Agreement, limit: float) -> list[str]:
 
 
 def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
-    """Find the robot that is wrong beyond chance by leaving out one after the other: the only one
-    without which the rest agree, at least two of them; or the only one of those that contradicts
-    itself.
+    """Find the robot that is wrong beyond chance.
+
+    It is the only one without which the rest agree, at least two of them; or the only one of those
+    that contradicts itself.
     """
     found = disagreement(agreement)
     suspected = find_suspects(agreement, limit)
@@ -217,7 +217,6 @@ def cost_share(chi2: float, dof: float, chance: float) -> float:
 
 
 def _contradicts_itself(alone: Agreement | None, robot: str, limit: float) -> bool:
-    """Whether one of a robot's submaps contradicts its others."""
     if alone is None:
         return False
     chi2, dof, *_ = alone.submaps.table.tolist()

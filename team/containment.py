@@ -31,7 +31,7 @@ class Handler(Protocol):
     """A handler of messages, with optional methods.
 
     refusal(message): why to refuse it, or None. handle_sample(message, sample): in place of
-    `handle`. set_aside(message, why): the messages that replace the answer after an exception.
+    `handle`. set_aside(message, why): the messages after an exception.
     """
 
     def handle(self, message: m.Message) -> list[Outgoing]:

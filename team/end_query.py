@@ -23,8 +23,8 @@ class EndQuery:
     """Query the router for the samples that end the team of this process.
 
     An end older than the process belongs to another run, unless SINCE is earlier, or an earlier
-    process of this node was in that run and left without a `Tally`. ends: the centre's final map,
-    or, without a centre, each robot's own. robot: the robot of interest; "*": all.
+    process of this node was in that run and left without a `Tally`. robot: the robot of interest;
+    "*": all.
     """
 
     def __init__(

@@ -58,8 +58,7 @@ class SubmapStore:
 
     A submap whose measurements overlap another's (law 1), and a member that differs from a stored
     one of its name, are refused. chains: the submaps available to a map, of streams with an initial
-    pose; they grow in place. withdrawals: the first order on each robot. verdicts: those in force,
-    with their landmarks in order.
+    pose; they grow in place. withdrawals: the first order on each robot.
     """
 
     def __init__(self) -> None:
@@ -164,7 +163,6 @@ class SubmapStore:
             self.chains[key] = stream.chain
 
     def _refusal_of_submap(self, submap: m.Submap) -> str | None:
-        """Store a submap, or return why not, by the submaps nearest in sequence."""
         key = submap.robot, submap.incarnation
         stream = self._stream(key)
         name = f"submap {submap.sequence} of {submap.robot}, incarnation {submap.incarnation}"

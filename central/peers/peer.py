@@ -22,9 +22,8 @@ CENTRE = "central"
 class Peer:
     """The team's set at the node `name`, and its fold.
 
-    carried: forwarded members until they are logged. world_alive: None before any message of a
-    world. ended: robots whose end the router stores. others: present robots and centre.
-    unpublished: messages of a requested fold.
+    carried: forwarded members until they are logged. ended: robots whose end the router stores.
+    others: present robots and centre. unpublished: messages of a requested fold.
     """
 
     def __init__(

@@ -34,7 +34,7 @@ def make_request(
     """Request the members in a summary that this replica lacks; None: there are none.
 
     not_now: (stream, sequence) requested recently. A stream with equal sequences and another digest
-    is requested whole: its robot has contradicted itself.
+    is requested whole.
     """
     if summary.digest == replica.digest:
         return None

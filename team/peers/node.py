@@ -52,8 +52,8 @@ def feed_order(message: m.Message) -> int:
 
 
 def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Message]:
-    """Yield members of streams beyond the counts `fed`: initial poses, then submaps by end time,
-    each after its inter-robot measurements. A fold in the order of time undoes nothing.
+    """Yield members of streams beyond the counts `fed` in the order of time, each submap after its
+    inter-robot measurements.
     """
     parcels: list[tuple[int, Stream, int]] = []
     for stream, share in sorted(replica.streams.items()):
@@ -88,8 +88,7 @@ MOST_OPEN = 16_384
 class PeerNode:
     """One node's copy of the set, and its exchange with other nodes.
 
-    known: nodes that may have a set. carried: new members by node. proofs: None: no keys, every
-    node is trusted. unsaved: new members since last cleared.
+    carried: new members by node. proofs: None: every node is trusted. unsaved: new members.
     """
 
     listens: tuple[ch.Channel, ...] = (*CHANNELS, ch.SET_SUMMARY)
