@@ -15,7 +15,7 @@ from teamslam.team.wire.bus import Bus, Outgoing, open_valid
 from teamslam.team.wire.codec import encoded
 
 if TYPE_CHECKING:
-    from teamslam.team.peers.proofs import Signs
+    from teamslam.team.keys.signing import Signer
 
 CENTRE_S = 10.0
 """Time [s] within which a running centre or robot is detected."""
@@ -80,7 +80,7 @@ class _RunningTeam:
         raise NoRobotError(f"the team has no robot {robot}; its robots: {known}")
 
 
-def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
+def publish_order(bus: Bus, order: Outgoing, signer: "Signer | None") -> None:
     """Publish an order, with keys also its signature."""
     bus.publish(order)
     if signer is not None:
@@ -92,7 +92,7 @@ def publish_order(bus: Bus, order: Outgoing, signer: "Signs | None") -> None:
 
 
 def withdraw(
-    bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
+    bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signer | None" = None
 ) -> m.FusedMap:
     """Order a robot's withdrawal; return the first map without it. Raises WithdrawError."""
     team = _RunningTeam(bus)
@@ -110,7 +110,7 @@ def withdraw(
 
 
 def give_up(
-    bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signs | None" = None
+    bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signer | None" = None
 ) -> None:
     """Order the team to go on without a lost robot; return on confirmation. Raises
     WithdrawError.
@@ -165,7 +165,7 @@ def judge(
     judgement: m.Judgement,
     reason: str,
     patience_s: float,
-    signer: "Signs | None" = None,
+    signer: "Signer | None" = None,
     *,
     withdrawn: bool = False,
 ) -> m.FusedMap:

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -14,7 +15,7 @@ from teamslam.central.peers.peer import CENTRE, Peer
 from teamslam.central.peers.robot import PeerRobot
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.peers.members import Member
-from teamslam.team.peers.proofs import Proofs, Signs
+from teamslam.team.peers.proofs import Proofs
 from teamslam.team.peers.set_file import SetFile
 from teamslam.team.robot.main import SECOND_PATIENCE_S, RobotShell
 from teamslam.team.shell import Shell
@@ -22,12 +23,15 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Tap
 
+if TYPE_CHECKING:
+    from teamslam.team.keys.signing import Signer
+
 
 class PeerCentre(Peer):
     """The centre's peer, which has no estimator and may join and leave at any time."""
 
     def __init__(
-        self, central: CentralConfig, robots: Sequence[str], signer: Signs | None = None
+        self, central: CentralConfig, robots: Sequence[str], signer: "Signer | None" = None
     ) -> None:
         proofs = None if signer is None else Proofs("", signer)
         super().__init__(CENTRE, central, robots, proofs=proofs)
@@ -92,7 +96,7 @@ class PeerShell(RobotShell):
         store: Path | None = None,
         exchange: Exchange = "continuous",
         when: FoldWhen = "always",
-        signer: Signs | None = None,
+        signer: "Signer | None" = None,
         maps: Sequence[m.SavedMap] = (),
         patience_s: float = SECOND_PATIENCE_S,
     ) -> None:
@@ -184,7 +188,7 @@ class CentreShell:
         stop: threading.Event,
         *,
         store: Path | None = None,
-        signer: Signs | None = None,
+        signer: "Signer | None" = None,
         maps: Sequence[m.SavedMap] = (),
     ) -> None:
         self._bus = bus

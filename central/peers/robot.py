@@ -4,6 +4,7 @@ Law 1: the fold's prior reaches `team/pose`, and nothing of it the robot's messa
 """
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -12,12 +13,15 @@ from teamslam.central.peers.fold import FoldWhen
 from teamslam.central.peers.peer import Peer, member_in
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.peers.members import CHANNELS, Member
-from teamslam.team.peers.proofs import Proofs, Signs, signed_by
+from teamslam.team.peers.proofs import Proofs, signed_by
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
+
+if TYPE_CHECKING:
+    from teamslam.team.keys.signing import Signer
 
 _OF_THE_FOLD = {
     ch.FUSED_MAP: ch.TEAM_MAP,
@@ -40,7 +44,7 @@ class PeerRobot(Peer):
         robots: Sequence[str],
         exchange: Exchange = "continuous",
         when: FoldWhen = "always",
-        signer: Signs | None = None,
+        signer: "Signer | None" = None,
     ) -> None:
         proofs = None if signer is None else Proofs(config.id, signer)
         super().__init__(ch.robot_node(config.id), central, robots, when, proofs)

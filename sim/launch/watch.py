@@ -17,7 +17,7 @@ from teamslam.team.wire.message_order import is_newer_map
 
 if TYPE_CHECKING:
     from teamslam.sim.launch.live_errors import LiveErrors
-    from teamslam.team.peers.proofs import Signs
+    from teamslam.team.keys.signing import Signer
 
 TURN_S = 0.1
 DRIVERS = "drivers"
@@ -57,7 +57,7 @@ class Watch:
     peers: frozenset[str] = frozenset()
     concluded: dict[str, m.Concluded] = field(default_factory=dict)
     concluded_s: dict[str, float] = field(default_factory=dict)
-    signer: "Signs | None" = None
+    signer: "Signer | None" = None
     centre: PeersAsCentre = field(default_factory=PeersAsCentre)
 
     @property

@@ -7,12 +7,15 @@ contains its certificate.
 """
 
 from collections.abc import Iterator
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 from teamslam.team.keys.roster import Issued
 from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.replica import Replica
 from teamslam.team.wire import messages as m
+
+if TYPE_CHECKING:
+    from teamslam.team.keys.signing import Signer
 
 MOST_SIGNATURES = 250_000
 """Most signatures stored per node; a robot has one per member."""
@@ -25,29 +28,10 @@ ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
 """Members that operators sign."""
 
 
-@runtime_checkable
-class Signs(Protocol):
-    """Sign as one node, and verify others' signatures (`team/keys/signing.py: Signer`)."""
-
-    certificate: bytes
-
-    def sign(self, named: bytes) -> bytes:
-        """Sign these bytes."""
-
-    def issued(self, node: str, certificate: bytes) -> Issued | str:
-        """Return the node's certificate as issued, or why it is not."""
-
-    def revoked(self, node: str) -> int:
-        """Return the last generation known to be revoked; 0: none."""
-
-    def is_signed(self, certificate: bytes, named: bytes, signature: bytes) -> bool:
-        """Return whether a certificate's key has signed these bytes."""
-
-
 class Proofs:
     """Signatures of one peer."""
 
-    def __init__(self, robot: str, signer: Signs) -> None:
+    def __init__(self, robot: str, signer: "Signer") -> None:
         self._robot = robot
         self._signer = signer
         self._signatures: dict[str, dict[bytes, bytes]] = {}
@@ -153,7 +137,7 @@ def signed_by(member: Member) -> str:
     return OPERATOR if isinstance(member.message, ORDERS) else about(member.message)
 
 
-def sign_order(signer: Signs, member: Member) -> m.Signature:
+def sign_order(signer: "Signer", member: Member) -> m.Signature:
     """Sign an operator's order, with its certificate in front."""
     certificate = signer.certificate
     proof = len(certificate).to_bytes(2, "little") + certificate + signer.sign(member.hash)
