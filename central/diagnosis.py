@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from teamslam.central.monitor import SCALE_SIGMAS, finding
+from teamslam.central.monitor import SCALE_SIGMAS, find_misscaled
 from teamslam.central.withdrawal import SUSPICION, cost_share
 from teamslam.team import core
 from teamslam.team.config import MAP, UNNAMED
@@ -31,7 +31,6 @@ from teamslam.team.estimation.map_joining.hypotheses import (
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import points_of
 from teamslam.team.estimation.map_joining.marginals import (
-    Agreement,
     BiasEstimate,
     scatter_of,
     terms,
@@ -131,7 +130,7 @@ def diagnose(
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
     withdrawn: submaps of withdrawn robots. normal: the right covariance scale; scale: the team's,
-    or its cost per degree of freedom. final: see `monitor.finding`.
+    or its cost per degree of freedom. final: see `find_misscaled`.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
@@ -159,8 +158,8 @@ def diagnose(
             if each.subject not in mirrored and not _is_bent(each, shared)
         ]
         costs = unbounded_costs(island) if final else terms(island).submaps
-        left = finding(Agreement(0.0, 0.0, {}, costs), normal, final=final)
-        noise = [_noise(*each) for each in left.misscaled if each.robot not in mirrored]
+        left = find_misscaled(costs, normal, final=final)
+        noise = [_noise(*each) for each in left if each.robot not in mirrored]
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
     return (*found, *noise)

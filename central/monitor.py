@@ -7,14 +7,12 @@ of bounds is one that chance alone reaches less than once in a thousand.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import Bias
 from teamslam.team.estimation.consistency import Scale
 from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
 from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
@@ -38,33 +36,18 @@ class Misscale(NamedTuple):
     log_sigma: float
 
 
-@dataclass(frozen=True)
-class Finding:
-    """The monitor's figures by name, and the covariance scales out of bounds."""
-
-    figures: dict[str, float]
-    misscaled: tuple[Misscale, ...]
-
-    def with_biases(self, biases: Sequence[BiasEstimate]) -> "Finding":
-        """Add each bias and its sigma, by robot and name."""
-        figures = {}
-        for (robot, _), bias, value, sigma in biases:
-            figures[f"bias.{robot}.{bias}"] = value
-            figures[f"bias_sigma.{robot}.{bias}"] = sigma
-        return replace(self, figures=self.figures | figures)
-
-
-NOTHING = Finding({}, ())
-
-
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     """Describe where the team's data contradict the models of all robots.
 
     Where odometry and ranges contradict each other about the size of a map, the robots' range
     scales move in one direction.
     """
-    ranges = _mean_of(biases, "range_scale")
-    if ranges is None:
+    known = [(value, sigma) for _, bias, value, sigma in biases if bias == "range_scale"]
+    if not known:
+        return ()
+    # They may share their errors (the map's scale), so the mean is no better known than each.
+    ranges, sigma = (float(each.mean()) for each in np.array(known).T)
+    if abs(ranges) <= max(MISCALIBRATED, SIGMAS * sigma):
         return ()
     return (
         "odometry or range scale not calibrated, covariance not valid: by the odometry, the "
@@ -73,33 +56,23 @@ def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
     )
 
 
-def _mean_of(biases: Sequence[BiasEstimate], name: Bias) -> float | None:
-    """Mean of a bias over the robots, if too large for errors of single ones."""
-    known = np.array([(value, sigma) for _, bias, value, sigma in biases if bias == name])
-    if not len(known):
-        return None
-    mean = float(known[:, 0].mean())
-    # They may share their errors (the map's scale), so the mean is no better known than each.
-    sigma = float(known[:, 1].mean())
-    return mean if abs(mean) > max(MISCALIBRATED, SIGMAS * sigma) else None
-
-
-def finding(agreement: Agreement, normal: float = 1.0, *, final: bool = True) -> Finding:
-    """Compute the team's and every robot's figures, and the scales out of bounds.
-
-    normal: the right covariance scale. final: only the final map reports too large covariances:
-    before a loop closure a robot's submaps hardly contradict each other.
-    """
+def monitor_figures(
+    agreement: Agreement | None, biases: Sequence[BiasEstimate], normal: float = 1.0
+) -> dict[str, float]:
+    """Compute the team's and every robot's figures; normal: the right covariance scale."""
     figures = {}
-    if agreement.dof >= 1.0:
-        figures["joint_cost_per_dof"] = agreement.chi2 / agreement.dof
-    for robot, (chi2, dof) in agreement.robots.items():
-        if dof >= 1.0:
-            figures[f"joint_cost_per_dof.{robot}"] = chi2 / dof
-    scales = _scales(agreement.submaps, normal)
-    for who, scale in scales.items():
-        figures[f"covariance_scale.{who}" if who else "covariance_scale"] = scale.value
-    return Finding(figures, _misscaled(scales, small=final))
+    if agreement is not None:
+        if agreement.dof >= 1.0:
+            figures["joint_cost_per_dof"] = agreement.chi2 / agreement.dof
+        for robot, (chi2, dof) in agreement.robots.items():
+            if dof >= 1.0:
+                figures[f"joint_cost_per_dof.{robot}"] = chi2 / dof
+        for who, scale in _scales(agreement.submaps, normal).items():
+            figures[f"covariance_scale.{who}" if who else "covariance_scale"] = scale.value
+    for (robot, _), bias, value, sigma in biases:
+        figures[f"bias.{robot}.{bias}"] = value
+        figures[f"bias_sigma.{robot}.{bias}"] = sigma
+    return figures
 
 
 def _scales(submaps: SubmapCosts, normal: float) -> dict[str, Scale]:
@@ -112,9 +85,16 @@ def _scales(submaps: SubmapCosts, normal: float) -> dict[str, Scale]:
     }
 
 
-def _misscaled(scales: Mapping[str, Scale], *, small: bool) -> tuple[Misscale, ...]:
-    """Select the scales out of bounds, the team's unless a minority explains it."""
-    judged = {who: each for who, each in scales.items() if small or each.value > 1.0}
+def find_misscaled(
+    submaps: SubmapCosts, normal: float = 1.0, *, final: bool = True
+) -> tuple[Misscale, ...]:
+    """Find the scales out of bounds, the team's unless a minority explains it.
+
+    final: only the final map reports too large covariances: before a loop closure a robot's submaps
+    hardly contradict each other.
+    """
+    scales = _scales(submaps, normal)
+    judged = {who: each for who, each in scales.items() if final or each.value > 1.0}
     robots = [who for who, each in judged.items() if who and _is_beyond(each, ROBOT_WARN)]
     team = "" in judged and _is_beyond(judged[""], SCALE_WARN)
     if team and (not robots or 2 * len(robots) > len(scales) - 1):

@@ -26,7 +26,7 @@ from teamslam.central.localising import (
     saved_landmarks,
     seeks_saved_map,
 )
-from teamslam.central.monitor import NOTHING, finding
+from teamslam.central.monitor import monitor_figures
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.survey import datum_of
@@ -61,7 +61,7 @@ class RecordedFields(NamedTuple):
 class SubmapFold:
     """Fold the stored set tick by tick and make the messages of its maps.
 
-    convicts: False for a recorded set. landmarks, finding, diagnosis, reasons: of the newest map.
+    convicts: False for a recorded set. landmarks, figures, diagnosis, reasons: of the newest map.
     not_folded: number of refused inputs.
     """
 
@@ -79,7 +79,7 @@ class SubmapFold:
         self.warnings: list[str] = []
         self.landmarks = 0
         self.not_folded = 0
-        self.finding = NOTHING
+        self.figures: Mapping[str, float] = {}
         self.diagnosis: tuple[m.Diagnosis, ...] = ()
         self.reasons: tuple[str, ...] = ()
         self._ticks = TickFold(config)
@@ -181,11 +181,6 @@ class SubmapFold:
         return {**self._ticks.suspended, **self._accused}
 
     @property
-    def figures(self) -> Mapping[str, float]:
-        """The monitor's figures."""
-        return self.finding.figures
-
-    @property
     def findings(self) -> tuple[str, ...]:
         """Causes of misfit, reasons and warnings about the map."""
         return (*map(describe, self.diagnosis), *self._warnings)
@@ -225,12 +220,10 @@ class SubmapFold:
         digest = ticks.digest(fold, self.config_digest, tail.encode())
         agreement = ticks.agreement(fold) if fold.contributions else None
         biases = marginals.bias_estimates(fold)
-        found = NOTHING
-        if agreement is not None:
-            judged = marginals.with_unbounded_costs(agreement, fold) if final else agreement
-            found = finding(judged, self.config.normal_scale, final=final)
-        self.finding = found.with_biases(biases)
-        figures = self.finding.figures
+        judged = agreement
+        if final and agreement is not None:
+            judged = marginals.with_unbounded_costs(agreement, fold)
+        figures = self.figures = monitor_figures(judged, biases, self.config.normal_scale)
         scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
         members = ticks.members(fold)
         if self.config.localise:

@@ -166,7 +166,7 @@ def test_the_final_map_comes_with_the_paths_and_its_cost():
     assert fused.final
     assert fused.joint
     assert fused.dof > 0
-    assert found.fold.finding.figures["joint_cost_per_dof"] == pytest.approx(
+    assert found.fold.figures["joint_cost_per_dof"] == pytest.approx(
         fused.chi2 / fused.dof, rel=0.05
     )
     paths = {t.robot: translate.trajectory_of(t) for t in of(out, ch.TRAJECTORY)}

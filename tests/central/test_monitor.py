@@ -1,9 +1,10 @@
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from teamslam.central.monitor import finding
+from teamslam.central.monitor import Misscale, find_misscaled, monitor_figures
 from teamslam.team.estimation.consistency import covariance_scale
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import JoinSettings, solve_fold
@@ -14,8 +15,13 @@ SETTINGS = JoinSettings()
 ROBUST = JoinSettings()
 
 
+class Watched(NamedTuple):
+    figures: dict[str, float]
+    misscaled: tuple[Misscale, ...]
+
+
 def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
-    """The finding of a joined team; `claim` changes a contribution before it is joined."""
+    """Figures and scales of a joined team; `claim` changes a contribution before it is joined."""
     world = team(seed, robots=3, submaps=30, landmarks=8)
     submaps = [claim(s) if claim else s for s in world.submaps]
     fold = joined_with(submaps, world.starts, (), settings, len(submaps))
@@ -23,7 +29,8 @@ def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
     agreement = marginals.joint_cost(solved)
     if final:
         agreement = marginals.with_unbounded_costs(agreement, solved)
-    return finding(agreement, normal, final=final)
+    misscaled = find_misscaled(agreement.submaps, normal, final=final)
+    return Watched(monitor_figures(agreement, (), normal), misscaled)
 
 
 def with_covariance_times(factor, of):
