@@ -195,7 +195,7 @@ class SubmapFold:
         raised = (
             f"{robot}: {count} submaps claim to be surer than {least_m:g} m and {least_rad:g} rad; "
             "taken as no surer than that"
-            for robot, count in self._ticks.raised.items()
+            for robot, count in self._ticks.inputs.raised(self._ticks.withdrawn).items()
         )
         streams = [s for s in sorted(self.store.chains) if self.store.maps and not is_map(s)]
         firsts = {stream: self._digest_first(stream) for stream in streams}

@@ -109,7 +109,7 @@ class TickFold:
     ) -> None:
         self._config = config
         self._limits = limits
-        self._inputs = FoldInputs(config) if inputs is None else inputs
+        self.inputs = FoldInputs(config) if inputs is None else inputs
         self._period = max(1, math.ceil(config.broadcast_s / config.tick_s))
         self.settings = join_settings(config)
         self.convicts = config.withdraw_above is not None
@@ -133,7 +133,7 @@ class TickFold:
 
     def add_start(self, start: InitialPoseFactor) -> None:
         """Add a stream's initial pose, before its submaps."""
-        self._inputs.add_start(start)
+        self.inputs.add_start(start)
 
     def add_submap(
         self,
@@ -143,7 +143,7 @@ class TickFold:
         own: OwnBiases = NO_OWN,
     ) -> None:
         """Add a submap with the inter-robot measurements from it; roll back to before its tick."""
-        tick = self._inputs.add_submap(submap, digest, sightings, own)
+        tick = self.inputs.add_submap(submap, digest, sightings, own)
         if submap.robot not in self._gone or tick <= self._conviction.at:
             self.roll_back(tick)
         else:
@@ -151,14 +151,14 @@ class TickFold:
 
     def set_verdicts(self, verdicts: Collection[Verdict]) -> None:
         """Replace an operator's verdicts; fold the changed ticks again."""
-        tick = self._inputs.set_verdicts(verdicts)
+        tick = self.inputs.set_verdicts(verdicts)
         if math.isfinite(tick):
             self._fold_again(tick)
 
     def withdraw_robot(self, robot: str) -> None:
         """Leave out a robot's submaps and the measurements of it, now and in future."""
         if robot not in self._ordered:
-            self._fold_again(self._inputs.first_tick_of(robot), self._ordered | {robot})
+            self._fold_again(self.inputs.first_tick_of(robot), self._ordered | {robot})
 
     def _fold_again(self, tick: float, ordered: frozenset[str] | None = None) -> None:
         until_ns = self._until_ns
@@ -206,7 +206,7 @@ class TickFold:
 
     @property
     def _until_ns(self) -> float:
-        return (self.checkpoints.tick + 1) * self._inputs.tick_ns
+        return (self.checkpoints.tick + 1) * self.inputs.tick_ns
 
     def fold_until(self, watermark_ns: float) -> bool:
         """Fold every tick up to the watermark; return whether there was one."""
@@ -219,8 +219,8 @@ class TickFold:
         return folded
 
     def _open_ticks(self, watermark_ns: float = math.inf) -> list[int]:
-        ticks = self._inputs.ticks_after(self.checkpoints.tick, self._gone)
-        return [tick for tick in ticks if (tick + 1) * self._inputs.tick_ns <= watermark_ns]
+        ticks = self.inputs.ticks_after(self.checkpoints.tick, self._gone)
+        return [tick for tick in ticks if (tick + 1) * self.inputs.tick_ns <= watermark_ns]
 
     def _push_tick(self, tick: int) -> bool:
         before = self.checkpoints.tick
@@ -237,17 +237,17 @@ class TickFold:
 
     def _fold_tick(self, fold: Fold, tick: int) -> Fold:
         """Fold a tick, with condensed submaps restored if contradicted."""
-        members = self._inputs.tick(tick, self._gone)
+        members = self.inputs.tick(tick, self._gone)
         size = fold.size
         if self._limits is None or size <= self._limits.begin:  # nothing is condensed yet
             return fold_tick(fold, members, self.settings)
         begin = self._limits.begin
         if fold.condensed_count and is_due(size, size + len(members.contributions), begin):
-            fold = self._inputs.restore_submaps(fold, tick - 1, self._gone)
+            fold = self.inputs.restore_submaps(fold, tick - 1, self._gone)
         fold = self.checkpoints.condense(fold, self._limits)
         after = fold_tick(fold, members, self.settings)
         if fold.condensed_count and is_contradicted(fold, after):
-            raw = self._inputs.restore_submaps(fold, tick - 1, self._gone)
+            raw = self.inputs.restore_submaps(fold, tick - 1, self._gone)
             after = after if raw.condensed_count else fold_tick(raw, members, self.settings)
         return after
 
@@ -262,7 +262,7 @@ class TickFold:
 
     def _size_until(self, tick: float) -> int:
         gone = self._gone.difference(self._conviction.suspended)
-        return len(self._inputs.keys(-math.inf, tick, gone))
+        return len(self.inputs.keys(-math.inf, tick, gone))
 
     def _convict(self, fold: Fold, at: float) -> bool:
         """Withdraw or suspend the robot that a trial finds; return whether there is one.
@@ -320,7 +320,7 @@ class TickFold:
         if other is None:
             other = self._others[gone] = self._fold_others(robots, -math.inf, self._limits)
         if math.isfinite(until_ns):
-            other.checkpoints.roll_back(until_ns // self._inputs.tick_ns)
+            other.checkpoints.roll_back(until_ns // self.inputs.tick_ns)
         other.fold_until(until_ns)
         return other
 
@@ -331,7 +331,7 @@ class TickFold:
         limits: Limits | None,
         cuts: tuple[Seam, ...] = (),
     ) -> "TickFold":
-        other = TickFold(self._config, limits, self._inputs)
+        other = TickFold(self._config, limits, self.inputs)
         other.checkpoints = Checkpoints(replace(EMPTY_FOLD, cuts=cuts))
         other.convicts = other._tries = False
         other._ordered = self._gone.union(robots)
@@ -354,7 +354,7 @@ class TickFold:
         folds: dict[str, Fold] = {}
         alone: dict[str, float] = {}
         for robot in sorted(team):
-            own = self.leave_out(self._inputs.robots - {robot}, self._until_ns)
+            own = self.leave_out(self.inputs.robots - {robot}, self._until_ns)
             apart = own.fold_ahead() if ahead else own.fold
             if apart.contributions:
                 alone.update(own.disagreement(apart))
@@ -418,7 +418,7 @@ class TickFold:
         if self._limits is None or fold.size <= self._limits.begin:
             return fold
         if not fold.has_unnamed or fold.size > FULL_UNNAMED:
-            fold = self._inputs.restore_submaps(fold, math.inf, self._gone)
+            fold = self.inputs.restore_submaps(fold, math.inf, self._gone)
             if not fold.condensed_count:
                 return fold
         return self._fold_others((), math.inf, None).fold
@@ -427,21 +427,16 @@ class TickFold:
         """Return the submaps of each robot left out."""
         return {
             robot: [
-                each for _, chain in sorted(self._inputs.chains(robot).items()) for each in chain
+                each for _, chain in sorted(self.inputs.chains(robot).items()) for each in chain
             ]
             for robot in self.withdrawn
         }
-
-    @property
-    def raised(self) -> Mapping[str, int]:
-        """Number of submaps with a raised covariance, by robot."""
-        return self._inputs.raised(self._gone)
 
     # The names of a fold.
 
     def digest(self, fold: Fold, *more: bytes) -> bytes:
         """Digest the fold's set and `more`."""
-        return self._inputs.digest(fold, more, self.checkpoints.tick, self._gone)
+        return self.inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
     def members(self, fold: Fold) -> Mapping[Stream, int]:
         """Return the last sequence of each stream, folded or refused."""

@@ -83,11 +83,6 @@ def profile_for(
     """Scale the lengths of a profile by √(σ_range² + (σ_bearing r)²) at r = farthest_m."""
     along = hypot(sensor.range_sigma, sensor.range_sigma_per_m * farthest_m)
     scale = max(hypot(along, sensor.bearing_sigma * farthest_m) / SCALE_M, 1.0)
-    return msgspec.structs.replace(
-        profile,
-        slack=profile.slack * scale,
-        density=profile.density / scale**2,
-        tight=profile.tight * scale,
-        near=profile.near * scale,
-        same=profile.same * scale,
-    )
+    lengths = {name: getattr(profile, name) * scale for name in LENGTHS}
+    lengths["density"] = profile.density / scale**2
+    return msgspec.structs.replace(profile, **lengths)

@@ -118,20 +118,16 @@ class Boundary:
         self.last = f"{what}{cut(key, 80)}: {type(error).__name__} at {place}: {cut(text, 200)}"
         LOG.error("set aside: %s", self.last)
         LOG.debug("%s", "".join(traceback.format_exception(error)))
-        digest = _name(sample)[1]
-        stamp_ns = min(max(sample.stamp_ns, -(2**62)), 2**62 - 1)
-        name = type(error).__name__
-        counter = max(sample.counter, -1)
         fault = m.Fault(
-            stamp_ns=stamp_ns,
+            stamp_ns=min(max(sample.stamp_ns, -(2**62)), 2**62 - 1),
             node=self.name,
             origin=key,
-            count=counter,
+            count=max(sample.counter, -1),
             message=tag,
-            error=name,
+            error=type(error).__name__,
             text=text,
             place=place,
-            digest=digest,
+            digest=_name(sample)[1],
         )
         return Outgoing(ch.FAULT, self.name, fault)
 

@@ -179,7 +179,7 @@ def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_
 
 
 def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
-    again = all_said._inputs.restore_submaps(all_said.fold, float("inf"), ())
+    again = all_said.inputs.restore_submaps(all_said.fold, float("inf"), ())
     assert again.condensed_count == 0
     assert again.landmarks.present.keys() == again.main.graph.landmarks.keys()
     assert again.main.graph.landmarks.keys() == all_said.fold.landmarks.sets.keys()

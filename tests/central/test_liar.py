@@ -263,10 +263,10 @@ def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot
     lying = of_set(run_with("r1", "still"), central=scenario(withdraw_above=None).central)
     lying.fold_until(math.inf)
     count = sum(each.robot == "r1" for each in messages(team_run(), m.Submap))
-    assert dict(lying.raised) == {"r1": count - BEFORE}
+    assert dict(lying.inputs.raised(lying.withdrawn)) == {"r1": count - BEFORE}
     for each in lying.fold.contributions:
         variances = np.linalg.eigvalsh(each.local.covariance)
         assert variances.min() >= 5e-5**2 * 0.99
     true = of_set(team_run())
     true.fold_until(math.inf)
-    assert dict(true.raised) == {}
+    assert dict(true.inputs.raised(true.withdrawn)) == {}
