@@ -187,10 +187,9 @@ _WITH_NODE = {m.Configuration, m.Progress, m.Status, m.Liveliness, m.Fault, m.Se
 def read_reply(channel: Channel, name: str, payload: bytes, wall_ns: int) -> Sample:
     """Convert a reply to a sample of its channel; raises `WireError` for one to another query."""
     if channel is ch.KEPT:
-        kept = decoded(payload, m.Kept)
-        stored = Sample(kept.key, kept.payload, kept.stamp_ns, kept.wall_ns, kept.counter)
+        stored = Sample(**msgspec.structs.asdict(decoded(payload, m.Kept)))
         if opened(stored)[0] not in ch.REPLIES[ch.KEPT]:
-            text = f"the router stores nothing on the key {kept.key[:80]!r}"
+            text = f"the router stores nothing on the key {stored.key[:80]!r}"
             raise WireError("wrong field", text)
         return stored
     message: m.Message = decoded(payload)

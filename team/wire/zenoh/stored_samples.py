@@ -9,6 +9,8 @@ no process of the team is present.
 import threading
 from dataclasses import dataclass, field
 
+import msgspec
+
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.channels import ENDS, FINAL_MAP, ORDERS
 from teamslam.team.wire.codec import WireError, decoded, encoded
@@ -35,8 +37,8 @@ class StoredMessages:
     _there: set[str] = field(default_factory=set, init=False)
     _silent: set[str] = field(default_factory=set, init=False)
     _ends: dict[str, _End] = field(default_factory=dict, init=False)
-    _orders: dict[bytes, str] = field(default_factory=dict, init=False)
-    _named: set[tuple[str, bytes]] = field(default_factory=set, init=False)
+    _orders: dict[tuple[str, bytes], tuple[str, bytes]] = field(default_factory=dict, init=False)
+    """By key and payload, the channel and the payload of the reply."""
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def token(self, node: str, *, alive: bool) -> bool:
@@ -49,7 +51,7 @@ class StoredMessages:
                 return False
             self._there.discard(node)
             if not self._there:
-                self._forget_orders()
+                self._orders.clear()
             return node in self._silent
 
     def last_word(self, node: str) -> None:
@@ -62,14 +64,7 @@ class StoredMessages:
     def take(self, sample: Sample, now_s: float) -> None:
         """Store an end or an order; raises `WireError` for an invalid one."""
         channel, _, message = opened(sample)
-        kept = Kept(
-            stamp_ns=sample.stamp_ns,
-            key=sample.key,
-            payload=sample.payload,
-            wall_ns=sample.wall_ns,
-            counter=sample.counter,
-        )
-        reply = encoded(kept)
+        reply = encoded(Kept(**msgspec.structs.asdict(sample)))
         decoded(reply, Kept)  # its receivers check the attachment, too
         if channel in ENDS and isinstance(message, FusedMap) and not message.final:
             raise WireError("wrong field", f"no final map on the key {sample.key!r}")
@@ -78,19 +73,14 @@ class StoredMessages:
             if channel in ENDS and (sample.key in self._ends or len(self._ends) < MOST_ENDS):
                 self._ends[sample.key] = _End(channel.name, now_s, reply, set(self._silent))
                 if channel is FINAL_MAP:
-                    self._forget_orders()
-            elif channel in ORDERS and name not in self._named and len(self._orders) < MOST_ORDERS:
-                self._named.add(name)
-                self._orders[reply] = channel.name
-
-    def _forget_orders(self) -> None:
-        self._orders.clear()
-        self._named.clear()
+                    self._orders.clear()
+            elif channel in ORDERS and len(self._orders) < MOST_ORDERS:
+                self._orders.setdefault(name, (channel.name, reply))
 
     def answer(self, request: KeptRequest, now_s: float) -> list[bytes]:
         """Return the stored samples for a node, the oldest first, as payloads of `Kept`."""
         with self._lock:
-            orders = [reply for reply, name in self._orders.items() if name in request.channels]
+            orders = [reply for name, reply in self._orders.values() if name in request.channels]
             ends = [
                 end
                 for end in self._ends.values()
