@@ -1,7 +1,6 @@
 """The driver's node: publish the file's measurements, answer requests, track the receivers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import ClassVar
 
 import msgspec
@@ -26,7 +25,6 @@ DAY_NS = 86_400 * 10**9
 Stream = tuple[int, int]  # (incarnation, measurements) that a receiver has consumed
 
 
-@dataclass
 class SourceNode:
     """Call `begin`, then `publish` and `handle` in turn until `finished`.
 
@@ -36,24 +34,19 @@ class SourceNode:
     set of its own. concluded: it has its final map. models: the robot's announced configuration.
     """
 
-    journal: Journal
-    finished: bool = field(default=False, init=False)
-    ordered_to_end: bool = field(default=False, init=False)
-    delivered: Stream = field(default=(0, 0), init=False)
-    recorded: Stream = field(default=(0, 0), init=False)
-    done: tuple[int, int, int] = field(default=(0, 0, 0), init=False)
-    joined: Stream = field(default=(0, 0), init=False)
-    is_peer: bool = field(default=False, init=False)
-    concluded: bool = field(default=False, init=False)
-    pose: m.PoseEstimate | None = field(default=None, init=False)
-    models: RobotConfig | None = field(default=None, init=False)
-    warnings: list[str] = field(default_factory=list, init=False)
-
-    def __post_init__(self) -> None:
-        self._robot = self.journal.robot
+    def __init__(self, journal: Journal) -> None:
+        self._robot = journal.robot
+        self.replace(journal)
+        self.finished = self.ordered_to_end = self.is_peer = self.concluded = False
+        self.delivered: Stream = (0, 0)
+        self.recorded: Stream = (0, 0)
+        self.joined: Stream = (0, 0)
+        self.done = (0, 0, 0)
+        self.pose: m.PoseEstimate | None = None
+        self.models: RobotConfig | None = None
+        self.warnings: list[str] = []
         self.alive: set[str] = set()  # the nodes of the team that are present
         self.run = ""  # the team's run by its recorder; empty: none is known
-        self._read_journal()
         self._said: m.StreamHead | None = None
         self._others: set[str] = set()
         self.fed: tuple[dict[str, float], tuple[str, ...]] = {}, ()
@@ -66,12 +59,8 @@ class SourceNode:
     def replace(self, journal: Journal) -> None:
         """Publish another journal from its beginning."""
         self.journal = journal
-        self._read_journal()
-
-    def _read_journal(self) -> None:
-        incarnations = self.journal.incarnations
-        self._incarnation = incarnations[0] if incarnations else 0
-        self._published = self.journal.count(self._incarnation)
+        self._incarnation = next(iter(journal.incarnations), 0)
+        self._published = journal.count(self._incarnation)
 
     listens: ClassVar[tuple[ch.Channel, ...]] = (
         ch.ROBOT_PROGRESS,
