@@ -1,5 +1,3 @@
-"""Headless Chromium, driven over the DevTools protocol."""
-
 import base64
 import json
 import shutil
@@ -112,7 +110,6 @@ class Page:
 
 @contextmanager
 def browsing(program: str) -> Iterator[Page]:
-    """Open a page in a Chromium that ends with the context."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         process = subprocess.Popen(
             [program, *_FLAGS, f"--user-data-dir={profile}", "about:blank"],

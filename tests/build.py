@@ -109,7 +109,6 @@ def verdict(
 
 
 def version(**last: int) -> tuple[m.VersionEntry, ...]:
-    """Version vector of a set: last sequence of each robot's first incarnation."""
     return tuple(
         m.VersionEntry(robot=robot, incarnation=1, sequence=sequence)
         for robot, sequence in last.items()

@@ -1,5 +1,3 @@
-"""Commands of `teamslam` in this process."""
-
 from click.testing import CliRunner, Result
 
 from teamslam.sim.cli.main import app
@@ -10,7 +8,6 @@ def run(*words: object) -> Result:
 
 
 def output_of(*words: object, status: int = 0) -> str:
-    """Run a command that ends with this status."""
     result = run(*words)
     assert result.exit_code == status, result.output
     return result.output

@@ -87,8 +87,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 class Shares(LoadScopeScheduling):
     """Scheduler that gives a worker whole files, whose fixtures are shared.
 
-    Files of tests/system go to the first TEAMS workers while other files are left, so that few
-    teams run at a time.
+    Files of tests/system go to the first TEAMS workers while others are left: few teams at a time.
     """
 
     def _split_scope(self, nodeid: str) -> str:

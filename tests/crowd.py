@@ -1,5 +1,3 @@
-"""A made-up log of a large team."""
-
 from collections.abc import Iterator
 
 import numpy as np

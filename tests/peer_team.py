@@ -1,5 +1,3 @@
-"""A team without a centre in one process: peer nodes, a simulated radio, team time."""
-
 import heapq
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field

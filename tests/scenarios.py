@@ -1,5 +1,3 @@
-"""Scenarios with changed fields; `final_only` is for tests that read the final map alone."""
-
 from pathlib import Path
 
 from msgspec.structs import replace

@@ -31,7 +31,6 @@ _through: list[Any] = []
 
 
 def modules_with_shapes() -> list[str]:
-    """Names of the modules whose functions state shapes of arrays."""
     return [
         ".".join(("teamslam", *path.relative_to(ROOT).with_suffix("").parts))
         for package in ("team", "central", "sim")

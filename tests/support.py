@@ -1,5 +1,3 @@
-"""Shared helpers: waiting, a link that can be cut, sample messages."""
-
 import contextlib
 import socket
 import threading
@@ -23,7 +21,6 @@ ROOT = Path(__file__).parents[1]
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0, what: str = "") -> None:
-    """Return once the condition holds; fail after the time."""
     wake = threading.Event()
     end = time.monotonic() + timeout_s
     while not condition():
@@ -32,7 +29,6 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 60.0, what: str
 
 
 def received(bus: Bus, count: int, timeout_s: float = 60.0) -> list[Sample]:
-    """Receive at least `count` samples; fail after the time."""
     samples: list[Sample] = []
 
     def enough() -> bool:

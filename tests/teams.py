@@ -28,7 +28,6 @@ LOCALISERS = ("localisation", "dead-reckoning")
 
 
 def config(name: str = "r1", **options: object) -> RobotConfig:
-    """A robot with few particles and windows of 3 s."""
     motion = MotionModel(forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02))
     base = RobotConfig(
         name,
@@ -127,7 +126,6 @@ def published(each: RobotStream) -> list[m.Measurement]:
 def driven(
     node: RobotNode, measurements: Sequence[m.Message], *, end: bool = True
 ) -> list[Outgoing]:
-    """Run a robot without a centre; `end`: with the end of the stream."""
     out = [o for measurement in measurements for o in node.handle(measurement)]
     if end:
         last = measurements[-1]
@@ -145,8 +143,6 @@ def submaps_of(each: RobotStream, **options: object) -> list[m.Submap]:
 
 
 class Submaps(Mapping[str, list[m.Submap]]):
-    """Submaps of robots without a centre, computed on first use."""
-
     def __init__(self, streams: Sequence[RobotStream]) -> None:
         self._streams = {each.robot: each for each in streams}
         self._submaps: dict[str, list[m.Submap]] = {}

@@ -58,7 +58,6 @@ def scarce(monkeypatch):
 
 
 def assert_each_measurement_once(samples):
-    """Check that submaps partition each robot's measurements, and that its ledger adds up."""
     messages = [opened(sample) for sample in samples]
     counted = {}
     for _, name, message in messages:
@@ -88,7 +87,6 @@ def assert_each_measurement_once(samples):
 
 @pytest.fixture(scope="module")
 def utias(tmp_path_factory):
-    """Three robots of a UTIAS data set, with observations between the odometry's stamps."""
     folder = tmp_path_factory.mktemp("utias") / "MRCLAM_Dataset0"
     scenario = load("waypoints")
     write_utias(streams_of(with_world(scenario, steps=45)), folder)

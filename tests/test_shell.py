@@ -45,8 +45,6 @@ def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(monkeypatc
 
 
 class Slow(MemoryBus):
-    """A bus on which a look takes time: `clock` advances, and events happen at their times."""
-
     def __init__(self, network: MemoryNetwork, clock: list[float]) -> None:
         super().__init__(network)
         self._clock = clock

@@ -122,7 +122,6 @@ def assert_same_solution(one, other):
 
 
 def test_a_refused_submap_is_not_restored(monkeypatch):
-    """The heading of r2's submap 11 exceeds a full turn: its chain ends there."""
     members = SUBMAPS.every()
     at = next(k for k, each in enumerate(members) if (each.robot, each.sequence) == ("r2", 11))
     turned = floats(members[at].mean, "mean").copy()

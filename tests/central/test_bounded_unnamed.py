@@ -30,7 +30,6 @@ def world():
 
 @pytest.fixture(scope="module")
 def cluttered():
-    """A robot that always sees the same sixteen landmarks, with clutter in every other submap."""
     rng = np.random.default_rng(6)
     angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
     landmarks = 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -189,7 +188,6 @@ def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
 
 @pytest.mark.parametrize("bounded", [True, False])
 def test_the_first_unnamed_landmarks_meet_all_named_ones(bounded):
-    """Sixteen landmarks, with identities in the first lap and without in the second."""
     rng = np.random.default_rng(7)
     angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
     landmarks = 20.0 * np.column_stack([np.cos(angle), np.sin(angle)])

@@ -26,11 +26,6 @@ INSIDE = CarriedOff("r2", 15.0, 2.0, AT_S + 4.3)
 
 
 class Run:
-    """A run with hidden identities: samples, true landmarks, r2's true path.
-
-    Running maps and poses are published only where r2 is carried far.
-    """
-
     def __init__(self, seed: int, *off: CarriedOff) -> None:
         world = StressWorld(seed=seed, seconds=220.0, hidden=True, carried_off=off)
         with TemporaryDirectory() as folder:

@@ -74,7 +74,6 @@ def test_a_robot_that_was_carried_off_is_named_with_place_and_time(tmp_path):
 
 
 def wrong_start(world: StressWorld, place: Path) -> m.Diagnosis:
-    """Best cause where r2's initial pose is stated (-3, 2) m and -0.7 rad off."""
     folder = write(world, place)
     start = folder / "r2" / "start.csv"
     head, row = start.read_text("utf-8").split()

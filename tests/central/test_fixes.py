@@ -52,7 +52,6 @@ def day(
     jumps=(),
     live=False,
 ):
-    """Samples of a team with fixes, and its world; live: with running maps and poses."""
     scenario = load("thesis-b")
     scenario = with_world(scenario, unknown_starts=unknown, steps=250)
     scenario = with_robots(scenario, gnss=Gnss(antenna=ANTENNA, sigma_m=SIGMA_M))

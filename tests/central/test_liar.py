@@ -33,7 +33,6 @@ BEFORE = 3
 
 
 def lie(true: m.Submap, base: m.Submap, kind: str) -> m.Submap:
-    """A false submap in place of a true one, with the landmarks of an earlier one."""
     poses = 1 + len(stamps(true.nodes, "nodes"))
     base_poses = 1 + len(stamps(base.nodes, "nodes"))
     points = floats(base.mean, "mean")[3 * base_poses :].copy()
@@ -200,7 +199,6 @@ def test_a_suspended_robot_that_comes_to_agree_is_in_the_map_again():
 
 @pytest.mark.parametrize("until_s", [20.0, 30.0, math.inf])
 def test_one_wrong_submap_costs_no_robot(until_s: float):
-    """A motion wrong by 0.8 m: the robust loss discounts it."""
     samples = team_run()
     (wrong,) = (s for s in messages(samples, m.Submap) if (s.robot, s.sequence) == ("r1", 2))
     mean = floats(wrong.mean, "mean").copy()

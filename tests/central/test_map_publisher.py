@@ -192,7 +192,6 @@ ROBOT = ("r1", 1)
 
 
 def blocks(shift=0.0, variance=0.01, count=40, sigmas=0.0):
-    """Landmarks in a row, a metre apart; the third moved by `shift` [m], all by `sigmas`."""
     ids = np.arange(count, dtype=np.uint32)
     means = np.column_stack([np.arange(count) * 1.0, np.zeros(count)])
     means[2, 1] += shift

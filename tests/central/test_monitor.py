@@ -21,7 +21,6 @@ class Watched(NamedTuple):
 
 
 def watched(seed, claim=None, settings=SETTINGS, normal=1.0, *, final=True):
-    """Figures and scales of a joined team; `claim` changes a contribution before it is joined."""
     world = team(seed, robots=3, submaps=30, landmarks=8)
     submaps = [claim(s) if claim else s for s in world.submaps]
     fold = joined_with(submaps, world.starts, (), settings, len(submaps))

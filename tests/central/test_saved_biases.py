@@ -136,7 +136,6 @@ def test_the_conditional_of_the_errors_is_the_saved_marginal():
 
 
 def test_a_sensor_that_was_replaced_loses_the_tie_and_is_named():
-    """Between seeds 1 and 2 the bias of r0 changes by 0.40, that of r1 by 0.01."""
     first, _, starts, _ = two_days(1, own=0.3, common=0.0)
     _, second, _, errors = two_days(2, own=0.3, common=0.0)
     fold = fold_of([contribution(saved_map(fold_of(first, starts))), *second])

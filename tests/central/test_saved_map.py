@@ -37,7 +37,6 @@ ALL = ("*",)
 
 
 def day(seed, maps=(), *, moved=(), unknown=(), scenario="thesis-b", streams=None):
-    """Samples, centre and truth of one day; moved: landmarks by number."""
     day_of = msgspec.structs.replace(load(scenario), seed=seed) if streams is None else scenario
     if streams is None:
         day_of = final_only(day_of)
@@ -384,7 +383,6 @@ def test_two_maps_with_a_day_in_common_would_count_it_twice():
 
 
 def classed(seed, classes):
-    """A day without identities; classes: reported class of a landmark, by number."""
     day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
     world = streams_of(final_only(day_of))
     streams = []
@@ -415,7 +413,6 @@ def test_a_map_without_identities_is_saved_with_classes_which_tell_it_from_anoth
 
 
 def hidden(seed, moved=()):
-    """A day without identities; moved: landmarks by number."""
     day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
     places = np.array(day_of.world.landmarks)
     for number, by in moved:

@@ -15,7 +15,6 @@ CAUSES = ("clock_offset", "odometry_scale", "bearing_offset", "range_offset")
 
 
 def mapped(world: StressWorld, place: Path, *, blind: bool = False) -> MapResult:
-    """The final map of this world; blind: without bias states."""
     scenario = final_only(scenario_in(write(world, place)))
     if blind:
         scenario = with_front_ends(scenario, biases=())

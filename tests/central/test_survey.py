@@ -48,7 +48,6 @@ def surveyed_landmarks(seed, numbers, wrong=None, origin=(0.0, 0.0)):
 
 
 def fold_drive(seed, surveyed, *, unknown=("*",), maps=()) -> tuple[m.FusedMap, CentralNode]:
-    """The final map of a drive's submaps, which do not depend on the survey, and its centre."""
     scenario, _, samples = drive(seed, unknown)
     config = msgspec.structs.replace(scenario.central, surveyed=surveyed)
     centre = make_centre(config, [each.id for each in scenario.robots])

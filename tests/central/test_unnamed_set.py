@@ -20,7 +20,6 @@ RING = 20.0
 
 @cache
 def two_robots() -> dict[str, list[m.Submap]]:
-    """Two robots with unknown initial poses on one ring, one behind the other."""
     rng = np.random.default_rng(8)
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 80))
     r = rng.uniform(16.0, 24.0, 80)

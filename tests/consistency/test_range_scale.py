@@ -22,7 +22,6 @@ SEEDS = range(100)
 
 
 def scale_errors(seeds, *, joined_ranges, way=0.01):
-    """(estimate − truth)/sigma of each robot's scale."""
     found = []
     for seed in seeds:
         submaps, starts, errors = carts(seed, robots=1, submaps=20, way=way)

@@ -1,8 +1,6 @@
 """Worlds with each form of measurement, and the NEES of their submaps.
 
-Odometry is speeds, increments on SE(2) with a lateral part and a correlated covariance, or a car's
-encoders; landmarks are points or range and bearing with their own covariances, from a mounted
-sensor. A mutant makes the stated covariances wrong.
+A mutant makes the stated covariances wrong.
 """
 
 from collections.abc import Callable, Iterator, Mapping

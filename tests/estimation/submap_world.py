@@ -40,7 +40,6 @@ def local_truth(start, end, points):
 
 
 def correlated(sigmas, rng):
-    """A covariance with these standard deviations and random correlations."""
     n = len(sigmas)
     root = np.eye(n) + 0.3 * rng.normal(size=(n, n)) / np.sqrt(n)
     covariance = root @ root.T

@@ -16,7 +16,6 @@ STARTS = {"r1": np.array([0.5, -1.0, 0.0]), "r2": np.array([1.0, 3.0, -2.0])}
 
 
 def team_run(seed, starts=STARTS, steps=8, seen=None):
-    """Rounds of (robot, sensor, motion, measurements), and the truth."""
     random = np.random.default_rng(seed)
     truth, rounds = dict(starts), []
     for _ in range(steps):

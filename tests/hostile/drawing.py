@@ -1,8 +1,7 @@
 """Hostile messages, and sessions of nodes that receive them, from a seeded generator.
 
-`Team` and `hostile_stream` draw sessions that are valid on the wire: singular covariances, jumping
-clocks, coordinates of 1e200 m. `extreme_samples` draws messages of every type with fields at the
-bounds of their types. `mutated` changes bytes.
+`Team` and `hostile_stream` draw valid sessions: singular covariances, jumping clocks, coordinates
+of 1e200 m. `extreme_samples` draws fields at the bounds of their types, `mutated` changes bytes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +44,6 @@ CHANNELS = {
 
 
 def valid(message: m.Message) -> m.Message | None:
-    """The message as received; None if the door refuses it."""
     try:
         return decoded(encoded(message), type(message))
     except (WireError, OverflowError):
@@ -253,7 +251,6 @@ def _interval(
 
 
 def _scan(rng: np.random.Generator, robot: str, number: int, stamp_ns: int) -> m.Measurement:
-    """Landmarks with or without identities and own covariances, as ranges or points."""
     n = int(rng.choice([0, 1, 2, 3, 6, 300], p=[0.1, 0.2, 0.3, 0.2, 0.18, 0.02]))
     ids = from_ids(rng.integers(1, 8 if n < 300 else 5000, n))
     ranges, bearings = np.abs(numbers(rng, n)), rng.uniform(-np.pi, np.pi, n)
@@ -399,7 +396,6 @@ FLAWS = ("robot", "incarnation", "number", "node", "name")
 
 
 def extreme(rng: np.random.Generator, message: m.Message) -> m.Message:
-    """Set some fields to extremes, as far as the door accepts them."""
     rate = rng.choice([0.1, 0.3, 0.9])
     for name in rng.permutation(list(message.__struct_fields__)).tolist():
         if rng.random() > rate or (name in FLAWS and rng.random() < 0.7):
@@ -467,7 +463,7 @@ def _row(rng: np.random.Generator, name: str, value: tuple[Any, ...]) -> tuple[A
 def extreme_samples(
     rng: np.random.Generator, kind: type[m.Message], count: int
 ) -> Iterator[tuple[ch.Channel, str, bytes]]:
-    """Channel, name and payload of `count` extreme messages of a class on each of its channels."""
+    """Extreme messages of a class, `count` on each of its channels."""
     (example,) = (each for each in examples() if type(each) is kind)
     for _ in range(count):
         robot = str(rng.choice(ROBOTS))

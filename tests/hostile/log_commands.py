@@ -39,7 +39,6 @@ def peak_mib() -> float:
 
 
 def main(folder: str, *logs: str) -> None:
-    """Warm up every command's imports on an invalid log, then measure."""
     import matplotlib.figure  # noqa: F401 - its memory is not the file's
     import pyarrow.parquet  # noqa: F401
 

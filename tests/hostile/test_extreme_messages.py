@@ -1,8 +1,7 @@
 """Extreme messages of every type, on every channel, to every node: nothing raises.
 
-A message is decoded or refused by name; each node handles the accepted ones within bounds of time
-and memory and answers with valid messages. TEAMSLAM_STORM=N draws N of each type for each channel;
-`make check-core CORE_TESTS=tests/hostile` checks the core's indices.
+TEAMSLAM_STORM=N draws N of each type for each channel; `make check-core CORE_TESTS=tests/hostile`
+checks the core's indices.
 """
 
 import os

@@ -110,7 +110,6 @@ def test_who_is_renewed_keeps_its_name_and_who_was_revoked_gets_another(tmp_path
 
 
 def test_every_channel_has_one_owner_and_the_world_alone_shares_the_sensors():
-    """A key without an owner could not be published with keys."""
     nodes = nodes_of(["r1", "r2"])
 
     def owners(key: str) -> list[str]:

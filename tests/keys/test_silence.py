@@ -66,7 +66,6 @@ def test_a_router_that_is_silent_for_longer_than_any_patience_ends_nobody(
 
 @contextmanager
 def answering(answer: bytes | None) -> Iterator[str]:
-    """A server that answers each connection with these bytes and closes it; None: no answer."""
     kept: list[socket.socket] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
 

@@ -60,8 +60,6 @@ def said(robot: str, submaps: int, mate: str) -> tuple[list[Member], ...]:
 
 
 class Storm:
-    """Peers with random order, delay, duplicates and reach of messages."""
-
     def __init__(self, seed: int, robots: int = 3, submaps: int = 4) -> None:
         self.rng = random.Random(seed)
         self.names = [f"r{i + 1}" for i in range(robots)]

@@ -139,7 +139,6 @@ class Renewed:
             proofs_of(self.r2).take_signature(proofs.sign(each), "r1")
 
     def submaps_of_r3(self) -> int:
-        """Submaps of r1 at r3 after some exchanges with r2 alone."""
         for _ in range(3):
             self.now_s += 10.0
             self.r2.tick(self.now_s)

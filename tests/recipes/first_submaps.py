@@ -57,6 +57,4 @@ class FirstSubmaps(SubmapFold):
 
 
 class FirstSubmapsCentre(CentralNode):
-    """The centre of `FirstSubmaps`."""
-
     fold_class = FirstSubmaps

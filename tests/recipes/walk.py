@@ -21,7 +21,6 @@ ROWS = {
 
 
 def add_rows() -> None:
-    """Add the rows to `teamslam.team.pairs` before anything imports it."""
     path = Path(teamslam.team.__file__).parent / "pairs.py"
     source = path.read_text()
     for before, row in ROWS.items():
@@ -34,7 +33,6 @@ def add_rows() -> None:
 
 
 def main(folder: Path) -> None:
-    """Print each run's final map and verification."""
     add_rows()
     from teamslam.central.desk.verification.verification import verify
     from teamslam.sim.in_memory.team import final_map

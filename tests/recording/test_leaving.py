@@ -1,5 +1,3 @@
-"""An ended process stays until the recorder has what only it can repeat."""
-
 import logging
 import threading
 from collections.abc import Iterator

@@ -110,7 +110,6 @@ def final_part(path: Path, part: int, samples: list[Sample]) -> Recorder:
 
 
 def in_two_parts(path: Path) -> None:
-    """A log whose first recorder was killed and whose second one finished it."""
     killed, _ = next_part(path, "t", {"scenario": "s"})
     killed.write(samples_of(10)[:5])
     wait_until(lambda: logged(path, c.ODOMETRY) == 5)
@@ -225,7 +224,6 @@ def test_a_recorder_started_after_the_end_completes_the_joining_and_ends_well(pa
 
 @pytest.fixture
 def limit():
-    """Limit the size of files that this process writes, as a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (soft if size < 0 else size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))

@@ -148,8 +148,6 @@ def test_a_recording_ends_with_the_final_map_and_the_last_token(path, endpoint):
 
 
 class Team:
-    """A source, its robot and the centre as one: it publishes, and answers for its stream."""
-
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
         self.published: list[m.Measurement] = []

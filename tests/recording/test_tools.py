@@ -197,7 +197,6 @@ def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(lives, rng):
 
 
 def set_back(samples: list[Sample], after: int, seconds: int) -> list[Sample]:
-    """The samples of a machine whose clock is set back once, after so many samples."""
     return [
         msgspec.structs.replace(s, wall_ns=s.wall_ns - (k >= after) * seconds * 10**9)
         for k, s in enumerate(samples)

@@ -40,8 +40,6 @@ def test_a_robot_whose_earlier_life_has_gone_begins():
 
 
 class Source:
-    """The source of r1's stream on a bus, which answers for its publications."""
-
     answers = True
 
     def __init__(self, network: MemoryNetwork) -> None:

@@ -171,7 +171,6 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
 
 
 def out_of_order(measurements):
-    """Stamp the measurement before each odometry interval half a second behind its end."""
     late = []
     for measurement, following in pairwise([*measurements, None]):
         ends = following is not None and isinstance(following, m.Odometry)
@@ -358,7 +357,6 @@ def test_what_a_robot_holds_until_a_rendezvous_is_given_to_nobody():
 
 
 def rolling(seed: int) -> list[m.Measurement]:
-    """Odometry at 50 Hz with stops, leaps and implausible speeds, and scans in any order."""
     rng = np.random.default_rng(seed)
     found: list[m.Measurement] = [build.initial_pose(incarnation=0)]
     tick_ns, now_ns = 20_000_000, 0

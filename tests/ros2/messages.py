@@ -1,5 +1,3 @@
-"""ROS 2 messages and bags, written by rosbags."""
-
 from collections.abc import Sequence
 from math import cos, sin
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""A live ROS 2 robot: keys of rmw_zenoh and of a bridge, from an independent publisher."""
-
 import struct
 import time
 from decimal import Decimal

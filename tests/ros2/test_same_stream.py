@@ -1,5 +1,3 @@
-"""A live ROS 2 robot and its bag as a data set give one stream, byte for byte."""
-
 import numpy as np
 import pytest
 

@@ -1,5 +1,3 @@
-"""Logs built by hand: a world's publications and a team's messages."""
-
 from collections.abc import Sequence
 
 import msgspec
@@ -26,7 +24,6 @@ STEPS = 20
 
 
 def scenario(seed: int = 1, robots: int = 1) -> Scenario:
-    """A small world of 8 landmarks and a few steps, with an accurate sensor."""
     motion = MotionModel(
         kind="turn-then-drive", forward=MotionNoise(per_s=0.05), turn=MotionNoise(per_s=0.02)
     )
@@ -101,7 +98,6 @@ def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoin
 
 
 def joined_log(of: Scenario, deviation: float) -> list[Sample]:
-    """The world's log with a joined map and trajectories, off by `deviation` everywhere."""
     world = streams(of)
     assert world.landmarks is not None
     out = []
@@ -115,7 +111,6 @@ def joined_log(of: Scenario, deviation: float) -> list[Sample]:
 
 
 def counted_twice(log: Sequence[Sample]) -> list[Sample]:
-    """The log with every observation twice, as two measurements."""
     doubled = []
     for sample in log:
         _, _, message = opened(sample)

@@ -1,5 +1,3 @@
-"""Logs to recompute: written from samples, honest or tampered with."""
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -24,7 +22,6 @@ Change = Callable[[m.Message], m.Message | None]
 
 
 def thesis(steps: int, **options: str | int) -> Scenario:
-    """The thesis world, shorter, with windows of 10 s."""
     scenario = with_options(load("thesis"), **options)
     return with_front_ends(with_world(scenario, steps=steps), window_s=10.0)
 
@@ -41,7 +38,6 @@ def written(path: Path, samples: Iterable[Sample], more: Mapping[str, str] | Non
 
 
 def changed(samples: Sequence[Sample], channel: ch.Channel, change: Change) -> list[Sample]:
-    """Apply `change` to every message of a channel; None removes it."""
     out = []
     for sample in samples:
         found, _, message = opened(sample)
@@ -65,7 +61,6 @@ def said(team: Team) -> list[Sample]:
 
 
 def check_recomputed(samples: Sequence[Sample]) -> None:
-    """Check that a log's maps are recomputed to the same bytes."""
     recorded = Recorded()
     recorded.take_all(samples)
     computed = recompute_centre(recorded)

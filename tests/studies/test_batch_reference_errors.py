@@ -9,7 +9,6 @@ from tests.sim.logs import joined_log, scenario, without_starts
 
 
 def lasting_scenario(seed: int) -> Scenario:
-    """The small world with errors that persist for longer than its robots look."""
     of = scenario(seed)
     sensor = msgspec.structs.replace(
         of.robots[0].sensor,

@@ -17,7 +17,6 @@ STEPS = 40
 
 
 def short(parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """The same run with the first steps only; the paths are shortened likewise."""
     return {
         name: value
         if name == "late"

@@ -10,8 +10,6 @@ from tests.system.processes import until
 
 
 class Observer:
-    """Count the messages of some channels; a context manager."""
-
     def __init__(self, endpoint: str, channels: Sequence[Channel], team: str = "short") -> None:
         self._bus = ZenohBus(team, endpoint)
         self._counts: dict[str, int] = {}

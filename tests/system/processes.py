@@ -1,7 +1,4 @@
-"""Real processes under test: started, watched, ended by their ids, and none left.
-
-A process works in its test's own folder, by which the children of a killed parent are found.
-"""
+"""Real processes under test: started, watched, ended by their ids, and none left."""
 
 import asyncio
 import codecs
@@ -23,7 +20,6 @@ _PROC = Path("/proc")
 
 
 async def until(condition: Callable[[], object], what: str, timeout_s: float = 180.0) -> None:
-    """Return once the condition holds; fail after the time."""
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end, f"not within {timeout_s:g} s: {what}"
@@ -51,7 +47,6 @@ class Process:
         self._process.send_signal(number)
 
     async def says(self, text: str) -> None:
-        """Return when it has printed this; fail when it ends before."""
         await until(lambda: text in self.said() or self.exit is not None, f"{self.name}: {text}")
         assert text in self.said(), f"{self.name} ended with {self.exit}:\n{self.said()}"
 
@@ -100,7 +95,6 @@ class Processes:
     async def run(
         self, name: str, command: Sequence[str | Path], errors: int = asyncio.subprocess.STDOUT
     ) -> Process:
-        """Start a command; `errors`: file of its standard error."""
         output = self.folder / f"{name}.said"
         with output.open("wb") as file:
             process = await asyncio.create_subprocess_exec(
@@ -157,7 +151,6 @@ class Processes:
             pytest.fail(f"left behind: {self.alive()}")
 
     async def close(self) -> None:
-        """End all by their ids; fail when their children outlive them."""
         for process in reversed(self._started):
             await process.end()
         try:

@@ -1,7 +1,6 @@
 """An attacker with a robot's valid certificate harms that robot alone.
 
-Attacks on a whole team of processes with keys: the map stays that of an undisturbed team, no
-process ends, and the logs stay small.
+The map stays that of an undisturbed team, no process ends, and the logs stay small.
 """
 
 import asyncio
@@ -42,7 +41,6 @@ def forge_final_map(bus: ZenohBus) -> None:
 
 
 def flood_unknown_keys(bus: ZenohBus) -> None:
-    """Publish statuses on keys that no channel has, below the robot's own name."""
     payload = encoded(build.status(node="robot/r2"))
     for count in range(FLOOD):
         bus.publish_raw(Sample(f"robot/r2/x{count}/status", payload, 0, time.time_ns(), count))
@@ -54,7 +52,6 @@ def flood_garbage(bus: ZenohBus) -> None:
 
 
 def speak_to_terminals(bus: ZenohBus) -> None:
-    """Publish texts with terminal escapes, markup and forged lines; flip the token."""
     status = build.status(
         node="robot/r2", state=f"map{ESCAPES}", figures={ESCAPES: 1e300}, warnings=(ESCAPES,) * 3
     )

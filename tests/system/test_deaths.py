@@ -17,7 +17,6 @@ PACE = "5"
 
 
 async def launched(team: Processes, speed: str = PACE) -> tuple[Process, Path]:
-    """A launch that has r1's first submap, seconds before its end; and its run's folder."""
     folder = team.folder / "run"
     launch = await team.start(
         *("launch", short(team.folder), "--speed", speed, "--no-report"),

@@ -19,7 +19,6 @@ OFFLINE = ("--no-deps", "--no-index")
 
 
 async def done(team: Processes, name: str, command: Sequence[object]) -> str:
-    """Output of a command that ends with 0, without a PYTHONPATH to our sources."""
     words = ["env", "-u", "PYTHONPATH", *(str(word) for word in command)]
     process = await team.run(name, words)
     assert await process.ended() == 0, process.said()
@@ -38,7 +37,6 @@ def source(tmp_path_factory):
 
 
 def build_wheel(source: Path, levels: str) -> subprocess.CompletedProcess[str]:
-    """Build the wheel into `dist`, without network."""
     build = [
         *PIP,
         "wheel",

@@ -117,8 +117,6 @@ async def test_a_comparison_pair_ends_with_the_bytes_of_a_team_in_memory(team):
 
 @dataclass(frozen=True)
 class Watched:
-    """A launch in a terminal: its screen, and its JSON."""
-
     shown: str
     result: dict[str, Any]
 

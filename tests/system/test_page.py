@@ -1,8 +1,3 @@
-"""The page in a real browser: a recorded log, and a running team.
-
-Skipped without a Chromium; `make test` installs one where it may (tests/get-chromium).
-"""
-
 import asyncio
 import json
 import re

@@ -50,7 +50,6 @@ WAYS = ("with", "without", "dies")
 
 
 def scenario_of(case: str, utias: Path) -> Scenario:
-    """A case by its name; `@100` limits it to so many steps, or seconds of a data set."""
     case, _, length = case.partition("@")
     if length:
         whole = scenario_of(case, utias)
@@ -88,7 +87,6 @@ class Storm:
         self.due = sorted(times)
 
     def reach(self, one: str, other: str, now_ns: int) -> bool:
-        """The last robot meets the first only; else random until the end."""
         pair = sorted((one, other))
         loner = self.names[-1]
         if len(self.names) > 2 and loner in pair and self.names[0] not in pair:

@@ -2,9 +2,7 @@
 
     python -m tests.trials.comm_range [--steps N] [--picture docs/static/comm_range.png]
 
-`random-10` without a centre, in memory. Over team time: the error of each robot's position
-(`team/pose`, or else its own pose), and the error and number of its map's landmarks, without
-alignment.
+`random-10` without a centre, in memory, without alignment.
 """
 
 import argparse
@@ -37,7 +35,6 @@ Rows = dict[str, list[float]]
 
 
 def measured(range_m: float | None, steps: int) -> Rows:
-    """By time: RMS over robots of the error of pose and map, and the mean count of landmarks."""
     scenario = with_options(load("random-10"), centre=False, comm_range_m=range_m)
     world = scenario.world
     assert isinstance(world, SimulatedWorld)

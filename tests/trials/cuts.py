@@ -34,8 +34,6 @@ Commands = Mapping[str, Sequence[str]]
 
 @dataclass
 class Run:
-    """Result of one run; cuts: time [s after the start], node, duration [s]."""
-
     number: int
     cuts: list[tuple[float, str, float]] = field(default_factory=list)
     exits: dict[str, int] = field(default_factory=dict)
@@ -104,7 +102,6 @@ class Team:
         return self.started[node].poll() is None
 
     def stop(self) -> dict[str, int]:
-        """Stop the rest; return each exit status, 99 for those still running."""
         found = {node: process.poll() for node, process in self.started.items()}
         for node, process in self.started.items():
             if process.poll() is None:
@@ -115,12 +112,10 @@ class Team:
 
 
 def link_of(node: str) -> str:
-    """Name of a process's link at the bridge: 15 letters at most."""
     return node.replace("driver", "d")
 
 
 def disturb(run: Run, team: Team, options: argparse.Namespace) -> None:
-    """Cut links at random times, until all have ended or time is over."""
     rng = random.Random(f"{options.seed} {run.number}")
     moments = sorted(rng.uniform(0.0, options.span) for _ in range(options.cuts))
     nodes = [node for node in team.started if node != "router"]
@@ -171,7 +166,6 @@ def play(
 
 
 def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> int:
-    """Make the missing runs, print them and the totals; return the exit status."""
     runs = []
     if options.json and options.json.exists():
         runs = [Run(**row) for row in json.loads(options.json.read_text())]

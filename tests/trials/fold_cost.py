@@ -31,8 +31,6 @@ T = TypeVar("T")
 
 
 class Clock:
-    """CPU seconds of the work done in it; nested work counts once."""
-
     def __init__(self) -> None:
         self.s = 0.0
         self._depth = 0
@@ -59,7 +57,7 @@ class TimedFold(PeerFold):
 
 
 class Timed(PeerRobot):
-    """A peer whose CPU time is counted: all, its fold, and its fold when the streams end."""
+    """A peer whose CPU time is counted."""
 
     def __init__(self, scenario: Scenario, config: RobotConfig, when: FoldWhen) -> None:
         names = [each.id for each in scenario.robots]

@@ -41,7 +41,6 @@ SUBMAPS = 1_500
 
 
 def door(count: int, seed: int) -> tuple[int, int, list[str]]:
-    """Numbers of mutated payloads refused and accepted, and the escaped errors."""
     rng = random.Random(seed)
     refused = passed = 0
     escaped: list[str] = []
@@ -62,7 +61,6 @@ def door(count: int, seed: int) -> tuple[int, int, list[str]]:
 
 
 def storm(bus: ZenohBus, options: argparse.Namespace, launch: subprocess.Popen[bytes]) -> Counter:
-    """Publish until everything is sent or the run is over; return the count of each channel."""
     rng = random.Random(options.seed)
     sent: Counter[str] = Counter()
     mutants = options.through

@@ -52,8 +52,6 @@ GAVE_UP = re.compile(r"(\S+) \(pid \d+\) ended with exit status \d+")
 
 @dataclass
 class Run:
-    """Result of one run; hit: node killed or stopped, and when [s after the launch]."""
-
     number: int
     hit: list[tuple[float, str]] = field(default_factory=list)
     exit: int | None = None
@@ -77,7 +75,6 @@ class Run:
 
 
 def children(launch: int, folder: Path) -> dict[int, list[str]]:
-    """Command lines of a run's processes but for `launch`, by pid."""
     found = {}
     for entry in PROC.iterdir():
         if entry.name.isdigit() and int(entry.name) != launch:
@@ -226,7 +223,6 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
 
 
 def await_start(folder: Path, launch: subprocess.Popen[bytes], node: str) -> None:
-    """Return when a node has connected; the world publishes soon after."""
     end = time.monotonic() + 120.0
     said = folder / "run" / f"{node}.log"
     while time.monotonic() < end and launch.poll() is None:
@@ -239,7 +235,6 @@ def hit(
     launch: int, folder: Path, rng: random.Random, what: list[str], stop_s: float, run: Run,
     awake: list[tuple[float, int]], at_s: float,
 ) -> None:  # fmt: skip
-    """Kill one process of the wanted kinds, or stop it until later."""
     stopped = {pid for _, pid in awake}
     lines = children(launch, folder).items()
     there = {p: li for p, li in lines if li[0] in what and p not in stopped}

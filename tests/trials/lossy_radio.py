@@ -2,9 +2,8 @@
 
     sudo python -m tests.trials.lossy_radio --runs 1 --loss 15,25,30 --delay 60,120,150
 
-Needs root and `ip` (Linux). Robot r1 is in one network namespace, all others in another. A run is
-good if all processes ended with 0 and the final map equals that of the same team in memory, or if
-all are alive at the time limit. Ends with 1 unless all are good.
+Needs root and `ip` (Linux). A run is good if all processes ended with 0 and the final map equals
+that of the same team in memory, or if all are alive at the time limit. Ends with 1 unless all are.
 """
 
 import argparse
@@ -117,7 +116,6 @@ class Radio:
 
 
 def tun_in(namespace: str) -> int:
-    """Create the TUN device `radio` of a namespace."""
     libc = ctypes.CDLL(None, use_errno=True)
     found = []
 
@@ -203,7 +201,6 @@ def one(
 
 
 def disturb(run: Run, link: Radio, team: Team, options) -> None:
-    """Cut the link at even intervals, until all have ended or time is over."""
     began = time.monotonic()
     due = [options.first + k * (options.cut + options.between) for k in range(options.cuts)]
     mend_s = None

@@ -1,8 +1,8 @@
 """Bound of online poses: the batch estimate of all measurements of the team until then.
 
-An extended Kalman filter over the poses at t and all landmarks, with Jacobians at the true state:
-without delay, submaps or linearisation error it bounds the mean accuracy of any estimator. For
-simulated worlds with known initial poses and one noise per second; its models are its own.
+An extended Kalman filter over the poses at t and all landmarks, with Jacobians at the true state,
+bounds the mean accuracy of any estimator. For simulated worlds with known initial poses and one
+noise per second; its models are its own.
 """
 
 from typing import NamedTuple
@@ -42,8 +42,7 @@ class Bounded(NamedTuple):
     def nees_on_arcs(self) -> np.ndarray:
         """NEES of (x, y, θ) of the estimate truth ∘ Exp(error).
 
-        Even with the right covariance a pose is no Gaussian in (x, y, θ): for a heading off by
-        three sigma it lies on an arc, outside its own ellipse.
+        Even with the right covariance a heading off by three sigma leaves the ellipse.
         """
         found = np.empty(len(self.errors))
         for k, (error, covariance) in enumerate(zip(self.errors, self.covariances, strict=True)):
@@ -60,7 +59,6 @@ class Bounded(NamedTuple):
         return found
 
     def nees_per_dof(self, stamps_ns: np.ndarray) -> float:
-        """NEES per degree of freedom of these poses; 1 on average."""
         at = np.isin(self.stamps_ns, stamps_ns)
         solved = np.linalg.solve(self.covariances[at], self.errors[at, :, np.newaxis])[:, :, 0]
         return float(np.mean(np.sum(self.errors[at] * solved, axis=1)) / 3.0)

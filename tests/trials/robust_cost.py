@@ -48,8 +48,6 @@ NEES = (0.95, 1.05)
 
 
 class Figures(NamedTuple):
-    """RMSE [m] and NEES per degree of freedom of one map."""
-
     rmse_m: float
     nees: float
 
@@ -90,7 +88,6 @@ def mean_and_error(values: Sequence[float]) -> tuple[float, float]:
 
 
 def report(profile: str, found: Mapping[str, Sequence[Figures]]) -> bool:
-    """Print a profile's lines; return whether the default is within its bounds."""
     right = True
     for name, figures in found.items():
         pairs = zip(found["default"], figures, strict=True)

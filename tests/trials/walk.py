@@ -78,7 +78,6 @@ class Walk:
 
 
 def _ends(message: m.Message) -> bool:
-    """Whether a message ends a stream or the run, before the last window or map."""
     return isinstance(message, m.End | m.TeamEnd | m.Done) or (
         isinstance(message, m.FusedMap) and message.final
     )
@@ -86,8 +85,6 @@ def _ends(message: m.Message) -> bool:
 
 @dataclass(frozen=True)
 class Row:
-    """A file of the walk: its lines, those of the functions entered, the calling files."""
-
     name: str
     lines: int
     entered: int

@@ -95,7 +95,6 @@ def write_bags(streams: tuple[RobotStream, ...], folder: Path) -> None:
 
 
 def starts(streams: tuple[RobotStream, ...]) -> dict[str, str]:
-    """Each robot's initial pose as the command line takes it."""
     found = {}
     for s in streams:
         x, y, theta = (repr(float(v)) for v in s.start.pose)
@@ -109,7 +108,6 @@ def starts(streams: tuple[RobotStream, ...]) -> dict[str, str]:
 
 
 def publish(mode: str, bag: Path, port: int, speed: float) -> None:
-    """Publish a bag's bytes after a line on standard input, in a session per robot."""
     with opened_bag(bag) as there:
         kinds = {topic.name: topic.kind for topic in there.topics}
         messages = [(m.arrival_ns, m.topic, bytes(m.data)) for m in there.messages(list(kinds))]
@@ -163,7 +161,6 @@ def publish(mode: str, bag: Path, port: int, speed: float) -> None:
 
 
 def of_data_set(scenario: Scenario) -> tuple[bytes, bytes, bytes]:
-    """Numbers, means and covariance of the final map, in memory."""
     found = final_map(list(run_team(scenario, streams_of(scenario))))
     return bytes(found.ids), bytes(found.means), bytes(found.covariance)
 
@@ -190,7 +187,6 @@ def imported(source: Path, folder: Path, *options: object) -> Scenario:
 
 
 def live(way: str, place: Path, speed: float, at: dict[str, str]) -> Path:
-    """Log of a live team driven by topics."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -328,7 +324,6 @@ def main() -> int:
 
 
 def judged(maps: dict[str, tuple[bytes, bytes, bytes]]) -> bool:
-    """Print the table; return whether all maps are as required."""
     right = True
     zero = maps.get("zip")
     for group in (EXACT, BY_POINTS):

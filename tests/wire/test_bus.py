@@ -1,5 +1,3 @@
-"""Contract of a bus, tested for the bus in memory and for the bus over Zenoh."""
-
 import threading
 from collections.abc import Iterable
 from contextlib import ExitStack

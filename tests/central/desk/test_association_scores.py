@@ -26,7 +26,6 @@ def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
 
 
 def truth(robot: str, labels: list[int]) -> Sample:
-    """One scan a second, with one detection of this label."""
     n = len(labels)
     stamps = from_stamps(np.arange(n) * TEN)
     message = m.TruthLabels(

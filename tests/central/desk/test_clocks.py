@@ -133,7 +133,6 @@ NOW_S = 1_763_800_000
 
 
 def presence(*behind: tuple[float, float]) -> Presence:
-    """A team's drivers, so many seconds behind the wall clock at two moments 2 s apart."""
     found = Presence()
     for node in ("central", "robot/r1", "robot/r2", "robot/r3"):
         found._take_message(build.liveliness(node=node), 0)

@@ -132,7 +132,6 @@ def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(monkey
 
 
 def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgement, ...]) -> Result:
-    """Run `teamslam verdict` in a team of r3 whose map rests on these verdicts."""
     monkeypatch.setattr(orders, "CENTRE_S", 2.0)
     network = MemoryNetwork()
     bus, over = MemoryBus(network), threading.Event()

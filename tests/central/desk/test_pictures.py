@@ -136,7 +136,6 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
 
 
 def test_changes_since_the_saved_map_are_drawn_as_on_the_page(run, tmp_path, monkeypatch):
-    """Landmark 1 moved by (2, 1), 2 is gone, 3 is new."""
     drawn: list[Figure] = []
     monkeypatch.setattr(
         "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
@@ -191,7 +190,6 @@ def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path, mo
 
 
 def test_compared_maps_in_an_arbitrary_frame_lie_over_the_aligned_truth(tmp_path, monkeypatch):
-    """The maps are off by a pure translation of 3 m on each axis."""
     drawn: list[Figure] = []
     monkeypatch.setattr(
         "teamslam.central.desk.compare.save", lambda figure, _: drawn.append(figure)

@@ -33,7 +33,6 @@ def page_of(run: Run, folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def log():
-    """A run in memory: each message a millisecond after the one before."""
     of = scenario(robots=2)
     return [
         msgspec.structs.replace(sample, wall_ns=(k + 1) * 1_000_000)

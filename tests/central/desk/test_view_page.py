@@ -139,7 +139,6 @@ def told_of(*messages: tuple[ch.Channel, m.Message]) -> list[dict[str, object]]:
 
 
 def test_the_page_gets_measurements_in_the_robots_frame():
-    """A sensor half a metre ahead, turned to the left; a landmark at most twice a second."""
     sensor = {"mount": [0.5, 0.0, np.pi / 2], "max_range": 30.0, "field_of_view": 2.0}
     config = build.configuration(configuration=json.dumps({"sensor": sensor}))
 

@@ -132,7 +132,6 @@ PROFILE_JOINT_COMPATIBILITY = AssociationProfile(slack=0.0)
 
 
 def _joint(points: list[tuple[float, float]], sd: float, common: float = 0.0) -> Joint:
-    """Independent errors; the second half of the points has a common error besides."""
     n = len(points)
     covariance = sd**2 * np.eye(2 * n)
     half = np.zeros((2 * n, 2))
@@ -216,7 +215,6 @@ TWINS = [(0.0, 0.0), (0.2, 0.0), (3.0, 1.0), (3.0, 1.2)]
 
 
 def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarray]:
-    """Known landmarks in pairs, some seen again with a common error."""
     n, m = len(TWINS), len(seen)
     points = np.array([*TWINS, *(TWINS[k] for k in seen)])
     covariance = 0.01**2 * np.eye(2 * (n + m))

@@ -28,7 +28,6 @@ R1, R2 = ("r1", 1), ("r2", 1)
 
 
 def small_world(seed: int, count: int) -> np.ndarray:
-    """Landmarks in 18 m by 15 m, at least 1 m apart."""
     rng, world = np.random.default_rng(seed), np.zeros((0, 2))
     while len(world) < count:
         point = rng.uniform((-9.0, -7.5), (9.0, 7.5))

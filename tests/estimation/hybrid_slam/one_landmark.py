@@ -1,5 +1,3 @@
-"""One measurement of one landmark by the step of FastSLAM."""
-
 import numpy as np
 
 from teamslam.team import core

@@ -28,7 +28,6 @@ class Drive:
     measurements: np.ndarray
 
     def judged(self, by="confirmed", outlier_share: float = 0.3, own=None, sensor=SENSOR):
-        """Marks of a `Consensus` of all keyframes, in the order of the measurements."""
         own = unclaimed(len(self.ids)) if own is None else own
         consensus = core.Consensus(
             noise_of(sensor), sensor.max_range, sensor.field_of_view, outlier_share
@@ -43,7 +42,6 @@ class Drive:
 
 
 def drive(seed: int, places: np.ndarray = PLACES) -> Drive:
-    """A robot on an arc of ten steps that sees all places in each, with the stated noise."""
     rng = np.random.default_rng(seed)
     motions, rows, pose = [], [], np.zeros(3)
     for k in range(10):

@@ -28,7 +28,6 @@ def scan(*rows):
 
 
 def driven(segmenter, *interval):
-    """Keyframes of an interval."""
     segmenter.drive(*interval)
     return segmenter.take_keyframes()
 

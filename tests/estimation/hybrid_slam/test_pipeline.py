@@ -104,7 +104,6 @@ def test_a_window_does_not_depend_on_what_was_read_before_it():
 
 
 def standing(window_m):
-    """A robot that stands for 45 s, then drives for 15 s, in intervals of a second."""
     front_end = FrontEnd(particles=8, window_s=10.0, window_m=window_m, standing_s=30.0, node_s=5.0)
     slam = HybridSlam(RobotConfig("r1", motion=NOISY, front_end=front_end), 1)
     closed = []

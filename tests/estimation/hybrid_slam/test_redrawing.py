@@ -94,7 +94,6 @@ def submap_of(keyframes: list[Keyframe], seed: int) -> LocalMap:
 
 
 def differences(keyframes: list[Keyframe]) -> list[float]:
-    """χ² (3 degrees of freedom) of one window's end poses by two seeds each."""
     maps = [submap_of(keyframes, seed) for seed in range(1, 5)]
     return [
         float((a.mean - b.mean)[:3] @ np.linalg.solve(a.covariance[:3, :3], (a.mean - b.mean)[:3]))

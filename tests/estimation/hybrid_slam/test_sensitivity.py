@@ -41,7 +41,6 @@ MOTION = MotionModel(
 
 
 def window_of(bearing, clock_offset, forward_scale, range_offset, range_scale, white=1.0):
-    """A robot on a curve among six landmarks, measured without noise but with these biases."""
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01, range_white=white, bearing_white=white)
     front = FrontEnd(particles=1600, resample_below=0.0, biases=BIASES)
     window, random = windows.open_window(front, sensor), random_numbers(1, "r1", 0, 0)
@@ -87,10 +86,7 @@ def test_a_column_is_how_the_particles_mean_answers_an_error_in_the_measurements
 
 
 def test_the_clocks_derivative_changes_as_the_curvature_states():
-    """In the true window's landmark places less those by a late one, S b + ½ D b² has a third of
-    the spread of S b alone. Particles and smoother differ at first order by a displacement of all
-    landmarks.
-    """
+    """The true landmark places less those by a late clock are S b + ½ D b²."""
     late, errors = 0.8, dict.fromkeys(BIASES, 0.0)
     true, off = window_of(**errors), window_of(**(errors | {"clock_offset": late}))
     clock = BIASES.index("clock_offset")
@@ -284,7 +280,6 @@ def test_the_factor_with_biases_is_what_central_differences_say(seed, count, bia
 
 
 def biased_team(seed):
-    """Submaps shifted by a share of each robot's two biases, and the biases."""
     world = team(seed, robots=2, submaps=6, landmarks=5)
     rng = np.random.default_rng([seed, 7])
     errors = {robot: rng.normal(size=2) * (0.01, 0.01) for robot in world.paths}

@@ -38,7 +38,6 @@ class Drive:
 
 
 def drive(seed, sensor, steps=12, noise=1.0):
-    """About 3.5 landmarks in sight, 3 to 20 m away; 0.98 m and up to 9° of turn a step."""
     rng = np.random.default_rng(seed)
     landmarks = rng.uniform(-40.0, 40.0, (18, 2))
     pose, motions, keyframes = np.zeros(3), [], []

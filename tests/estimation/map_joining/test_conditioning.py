@@ -106,7 +106,6 @@ def test_a_poor_prior_and_later_submaps_give_the_pose_of_the_full_join():
 
 
 def overconfident(local, shift):
-    """A submap whose end pose is off by `shift`, with a third of the standard deviations."""
     mean, scale = local.mean.copy(), np.ones(len(local.mean))
     mean[:3] += shift
     scale[:3] = 0.3

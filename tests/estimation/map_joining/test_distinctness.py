@@ -41,7 +41,6 @@ def folded(
     times: int = 2,
     heading_sd: float = 0.001,
 ) -> Fold:
-    """Two neighbours are seen twice; after a motion with an error of 0.3 m, one landmark."""
     fold = EMPTY_FOLD
     for k in range(2 + times):
         places, pose_sd = (PAIR if k < 2 else [later]), (0.3 if k == 1 else SD)
@@ -100,7 +99,6 @@ def test_what_a_lost_robot_has_seen_is_left_out_and_the_map_says_so(heading_sd, 
 
 
 def looked_at(times: int, found: int, verdicts: tuple[Verdict, ...] = ()) -> Fold:
-    """Two neighbours seen `times` times, a third landmark the first `found` times."""
     fold = EMPTY_FOLD
     for k in range(times):
         places = [*PAIR, FALSE] if k < found else PAIR

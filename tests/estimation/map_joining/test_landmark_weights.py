@@ -131,7 +131,6 @@ AT_ONCE = replace(ANNEALED, robust_start=1.0)
 
 
 def standing(robot, place, spread):
-    """A submap that ends at this place, with a pose node there."""
     mean = np.array([*place, 0.0, *place, 0.0])
     covariance = np.diag([*np.square([spread, spread, 0.01]), 1e-4, 1e-4, 1e-4])
     covariance[3:, 3:] += 0.99 * covariance[:3, :3]

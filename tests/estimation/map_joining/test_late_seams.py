@@ -72,7 +72,6 @@ def test_a_robot_that_comes_back_to_its_landmarks_has_no_seam(seed):
 
 
 def far_apart() -> Fold:
-    """Fold a drive through two places of seven landmarks each, 60 m apart, without return."""
     rng = np.random.default_rng(1)
     far = np.concatenate((SPARSE, SPARSE + np.array([60.0, 0.0])))
     before, _ = drive("r1", circle((0.0, 0.0), 8.0, ROUND, 1.0), far, rng, reach=6.0)

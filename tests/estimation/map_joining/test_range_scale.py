@@ -111,7 +111,6 @@ def test_at_joined_ranges_errors_are_times_the_ratio_of_distances_and_columns_th
 
 
 def _with_offset(submap):
-    """The submap with an offset of the ranges beside their scale."""
     local = submap.local
     points = local.end_pose[:2] / 2.0 - local.landmarks
     ahead = points / np.linalg.norm(points, axis=1, keepdims=True)

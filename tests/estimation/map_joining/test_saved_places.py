@@ -29,8 +29,7 @@ MOVED, BY = 3, np.array([0.25, -0.18])
 def island(first: int, having: int, submaps: int) -> Island:
     """A map of eight landmarks, and a robot in their midst, at rest.
 
-    first: number of the first landmark. The one at index MOVED is elsewhere, in `having` of the
-    robot's submaps.
+    The landmark at index MOVED is elsewhere, in `having` of the robot's submaps.
     """
     taken = [Contribution(*SITE, 0, 0, _local(first, PLACES))]
     for k in range(submaps):

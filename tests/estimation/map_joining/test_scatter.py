@@ -9,7 +9,6 @@ CHAINS, SUBMAPS, DRAWS = 3, 40, 600
 
 
 def _series(rng, fade):
-    """A stationary autoregressive series of unit variance."""
     series = [rng.standard_normal()]
     for fresh in rng.standard_normal(SUBMAPS - 1):
         series.append(fade * series[-1] + math.sqrt(1.0 - fade * fade) * fresh)

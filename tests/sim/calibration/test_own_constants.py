@@ -25,7 +25,6 @@ def looking(
     depth: bool = True,
     marker: float = 0.0,
 ) -> Reference:
-    """A robot that stands at the origin and reads eight landmarks 300 times, 1 % of the range."""
     rng = np.random.default_rng([int(robot[1:]), world])
     scale, offset, axis = camera
     ids = np.repeat(np.array(list(PLACES), np.uint32), 300)

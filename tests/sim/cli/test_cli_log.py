@@ -27,7 +27,6 @@ def run(*arguments: object) -> tuple[int, str, str]:
 
 
 def published() -> list[Sample]:
-    """A world of two robots; each key counts from 0, as on a bus."""
     counts: dict[str, int] = {}
     samples = []
     for sample in world_log(scenario(robots=2)):

@@ -247,7 +247,6 @@ def test_a_set_without_the_files_of_a_robot_is_run_by_the_others(folder):
 
 
 def mapped_by_waypoints(path):
-    """The first 25 s of a set, with few particles and the models of its robots."""
     scenario = with_options(load("utias"), robots=2, dataset=path)
     robots = tuple(
         msgspec.structs.replace(robot, sensor=of.sensor, motion=of.motion)

@@ -317,7 +317,6 @@ def test_tables_with_names_of_their_own_are_told_to_be_imported(tmp_path, place)
 def test_a_column_that_no_name_assigns_is_named_in_the_proposal_and_in_the_next_error(
     tmp_path, column, alone
 ):
-    """A bearing called phi, and a range that is not there."""
     logs, columns = tmp_path / "logs", tmp_path / "columns.toml"
     (logs / "r1").mkdir(parents=True)
     (logs / "r1" / "wheels.csv").write_text("time,v,omega,volts\n0,1,0,12\n1,1,0,12\n")

@@ -21,7 +21,6 @@ def truth(seconds: list[float], poses: np.ndarray) -> m.Truth:
 
 
 def line(seconds: list[float]) -> np.ndarray:
-    """Drive along x with 1 m/s and turn by 1 rad/s, across ±π."""
     return np.array([[s, 0.0, (3.0 + s + np.pi) % (2 * np.pi) - np.pi] for s in seconds])
 
 

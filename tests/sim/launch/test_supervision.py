@@ -109,7 +109,6 @@ def test_a_launch_whose_own_link_is_refused_supervises_on_until_the_processes_ha
 def test_a_router_that_is_killed_before_the_launch_has_entered_is_started_again(
     tmp_path, monkeypatch
 ):
-    """The router restarts at its former address before the team receives it."""
     monkeypatch.setattr(launching, "ROUTER_PATIENCE_S", 120.0)  # a busy machine
     router = Supervised(
         "router",

@@ -238,7 +238,6 @@ def test_the_truth_comes_whole_in_batches_and_on_its_own_channels_only():
 
 
 def again(r1: int, r2: int, recorder=None, **options):
-    """A restarted world whose robots have so many measurements."""
     expected = expected_nodes(["r1", "r2"], recorder=recorder is not None)
     node = world(expected=expected, **options)
     for name in sorted(expected):

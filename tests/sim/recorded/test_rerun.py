@@ -93,8 +93,6 @@ def test_what_every_other_pair_says_comes_out_again(estimator, fusion, tmp_path)
 
 
 def shifted(samples: list[Sample], channel: ch.Channel, victim: m.Message) -> list[Sample]:
-    """Add 0.25 m to the fourth mean of one map of the channel."""
-
     def change(message: m.Message) -> m.Message:
         if message != victim:
             return message

@@ -41,7 +41,6 @@ def true_detections(stream: RobotStream, landmarks: np.ndarray) -> tuple[np.ndar
 
 
 def inside_two_sided(normalised: np.ndarray) -> bool:
-    """Test the sum of squares against the two-sided 99.9 % chi-square interval."""
     low, high = chi2.ppf([0.0005, 0.9995], normalised.size)
     return bool(low < np.sum(normalised**2) < high)
 

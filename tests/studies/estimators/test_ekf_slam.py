@@ -37,7 +37,6 @@ def jacobian(function, at, h=1e-6):
 
 
 def some_state(rng, landmarks=4):
-    """A pose near the origin among landmarks 5 m away or more, all correlated."""
     angles = rng.uniform(-np.pi, np.pi, landmarks)
     points = rng.uniform(5.0, 15.0, landmarks)[:, None] * np.column_stack(
         (np.cos(angles), np.sin(angles))

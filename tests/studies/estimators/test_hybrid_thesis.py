@@ -76,7 +76,6 @@ ID = np.array([7], np.uint32)
 
 
 def run(steps: int, particles: int = 50, seed: int = 1) -> list[CodedState]:
-    """Straight past a landmark at (10, 5) whose measurements have no error."""
     generator = np.random.default_rng(seed)
     state = hybrid_thesis_coded.initial_state(np.zeros(3), particles)
     states = [state]

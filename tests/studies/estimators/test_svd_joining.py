@@ -104,7 +104,6 @@ def test_where_errors_are_spherical_the_map_is_consistent_and_where_they_are_not
 
 
 def two_maps(seed, sigma=0.1, common=4):
-    """Maps of overlapping landmarks about a truth, the second in its own frame."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-10.0, 10.0, (common + 4, 2))
     a_from_b = np.array([*rng.uniform(-20.0, 20.0, 2), rng.uniform(-3.0, 3.0)])

@@ -97,7 +97,6 @@ def test_a_robot_that_shares_too_little_stays_out_with_the_reason(rule):
 
 
 def _map_of(points: np.ndarray, ids: list[int], frame: np.ndarray) -> LandmarkGaussian:
-    """These points as seen by a robot whose start lies at `frame` in the team's."""
     back = inverse(frame)
     own = np.array([transformed(back, point) for point in points])
     return LandmarkGaussian(np.array(ids, np.uint32), own, 0.01 * np.eye(2 * len(ids)))
