@@ -1,10 +1,4 @@
-"""Detections without identities in a robot's folder of a data set.
-
-r1/detections.csv   t_s,range_m,bearing_rad, with c_rr,c_rb,c_bb and diameter_m in the scans that
-                    have them; class: reported class 0, 1, …, or its name in central.classes,
-                    right with class_probability (0.95)
-r1/labels.csv       landmark: row by row of detections.csv, -1 for clutter; for scoring (optional)
-"""
+"""Detections without identities in a robot's folder (docs/landmarks_without_names.md)."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

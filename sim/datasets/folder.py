@@ -1,19 +1,4 @@
-"""A data set in a folder (or zip) of CSV tables: a sub-folder for each robot.
-
-r1/odometry.csv       t_s with forward_m_s,yaw_rate_rad_s or x_m,y_m,theta_rad or
-                      dx_m,dy_m,dtheta_rad (with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt) or
-                      wheel_speed_m_s,steering_rad
-r1/observations.csv   t_s,landmark with range_m,bearing_rad (with c_rr,c_rb,c_bb) or
-                      x_m,y_m (with c_xx,c_xy,c_yy)
-r1/detections.csv     t_s,range_m,bearing_rad without identities, and r1/labels.csv for scoring
-                      (`teamslam.sim.datasets.detections_table`)                   (optional)
-r1/sightings.csv      t_s,teammate with range_m,bearing_rad or x_m,y_m    (optional)
-r1/fixes.csv          t_s,x_m,y_m, with c_xx,c_xy,c_yy: absolute positions  (optional)
-r1/start.csv          x_m,y_m,theta_rad, with c_xx,c_xy,c_yy,c_xt,c_yt,c_tt  (optional)
-r1/truth.csv          t_s,x_m,y_m,theta_rad                               (optional)
-landmarks.csv         landmark,x_m,y_m: the true ones                     (optional)
-scenario.toml         the models and options of the team                  (optional)
-"""
+"""A data set in a folder or zip of CSV tables, a sub-folder for each robot (docs/your_data.md)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,15 +1,6 @@
-"""Landmark graphs as data sets, in the text formats of isam, TORO, g2o and pyfg.
+"""Landmark graphs as data sets, in the formats of isam, TORO, g2o and pyfg (docs/your_data.md).
 
-isam      ODOMETRY | EDGE2 i j x y theta  S_xx S_xy S_xt S_yy S_yt S_tt
-          LANDMARK i landmark x y  S_xx S_xy S_yy        S: upper square root of the information
-TORO      VERTEX2 i x y theta; EDGE2 i j x y theta  I_xx I_xy I_yy I_tt I_xt I_yt
-          LANDMARK as above, with the information I
-g2o       VERTEX_SE2 i x y theta; VERTEX_XY landmark x y; FIX i
-          EDGE_SE2 i j x y theta  I_xx I_xy I_xt I_yy I_yt I_tt
-          EDGE_SE2_XY i landmark x y  I_xx I_xy I_yy
-
-A file with VERTEX2 is TORO's. isam and TORO state errors in the axes of the first pose, g2o in
-those of the measured second one. Weights may be left out: then they are 1.
+isam and TORO state errors in the axes of the first pose, g2o in those of the measured second one.
 https://github.com/RainerKuemmerle/g2o/wiki/File-Format-SLAM-2D
 """
 

@@ -1,13 +1,7 @@
-"""A data set of one robot whose landmarks have no names, in a folder of CSV tables.
+"""A data set of one robot whose landmarks have no names (docs/landmarks_without_names.md).
 
-odometry.csv      t_s,rear_wheel_speed_m_s,steering_rad, or step,dx_m,dy_m,dtheta_rad with the upper
-                  triangle of the covariance c_xx,c_xy,c_yy,c_xt,c_yt,c_tt; a step is taken as 1 s
-detections.csv    t_s,range_m,bearing_rad[,diameter_m], or step,x_m,y_m,c_xx,c_xy,c_yy
-labels.csv        landmark: row by row of detections.csv, -1 for clutter       (optional)
-reference_landmarks.csv, gps.csv                                               (optional)
-
-Labels, reference and GPS are for scoring: no estimator sees them, except the GPS with
-`world.fixes`.
+A step is taken as 1 s. Labels, reference and GPS are for scoring: no estimator sees them, except
+the GPS with `world.fixes`.
 """
 
 from dataclasses import replace

@@ -1,14 +1,4 @@
-"""Convert a user's TOML document to the plain fields of a resolved scenario.
-
-base = "thesis"            # optional: a built-in scenario that this file changes
-name, team, seed, estimator, fusion, exchange, peers, centre
-[world]      kind = "simulated" | "utias" | "folder", then the fields of teamslam.sim.world.config
-[defaults]   fields of every robot (teamslam.team.config.RobotConfig)
-[[robots]]   what is different for one robot; or robot_count = N for r1 … rN; absent in a UTIAS
-             world: its five; in a world of a folder: those that it has
-[radio]      fields of teamslam.sim.world.config.Radio: who reaches whom where there is no centre
-[central]    fields of teamslam.central.config.CentralConfig
-"""
+"""Convert a user's TOML document (docs/scenario.md) to the plain fields of a resolved scenario."""
 
 import re
 import tomllib
