@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from teamslam.sim.datasets.tables import LARGEST, DatasetError, File
-from teamslam.team.shapes import Float, Int64, UInt32
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 T = TypeVar("T")
 NANO = Decimal(10**9)
@@ -142,6 +142,11 @@ class CsvTable:
     def error(self, row: int, column: str, problem: str) -> DatasetError:
         """Error for one cell."""
         return DatasetError(f"{self.name}, line {self.lines[row]}, column {column}: {problem}")
+
+    def refuse(self, rows: Bool[np.ndarray, " rows"], column: str, problem: str) -> None:
+        """Raise the error of the first of these rows, if any."""
+        if rows.any():
+            raise self.error(int(rows.argmax()), column, problem)
 
     def fault(self, problem: str) -> DatasetError:
         """Error for the table's columns."""

@@ -62,8 +62,7 @@ def scans_of(
     """Scans without identities, one per stamp; raises DatasetError."""
     if (np.diff(stamps_ns) < 0).any():
         raise table.fault("its rows are not in order of time")
-    for row in np.flatnonzero(ranges < 0.0)[:1].tolist():
-        raise table.error(row, "range_m", "below 0")
+    table.refuse(ranges < 0.0, "range_m", "below 0")
     first = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[:1] - 1))
     return Detections(
         stamps_ns=stamps_ns[first],
@@ -91,10 +90,8 @@ def _classes_of(table: CsvTable, names: Sequence[str]) -> Float[np.ndarray, "R C
     reported = CsvTable(table.name, {CLASS: cells}, table.lines).numbers(CLASS)[:, 0]
     right = table.numbers(RIGHT)[:, 0] if table.has(RIGHT) else np.full(len(table), USUAL_RIGHT)
     is_class = (reported >= 0) & (reported < MOST_CLASSES) & (reported == np.floor(reported))
-    for row in np.flatnonzero(~is_class)[:1].tolist():
-        raise table.error(row, CLASS, f"no class: give a whole number from 0 to {MOST_CLASSES - 1}")
-    for row in np.flatnonzero((right <= 0.0) | (right >= 1.0))[:1].tolist():
-        raise table.error(row, RIGHT, "not between 0 and 1")
+    table.refuse(~is_class, CLASS, f"no class: give a whole number from 0 to {MOST_CLASSES - 1}")
+    table.refuse((right <= 0.0) | (right >= 1.0), RIGHT, "not between 0 and 1")
     count = max(2, int(reported.max()) + 1, len(names))
     is_reported = reported[:, np.newaxis] == np.arange(count)
     others = ((1.0 - right) / (count - 1))[:, np.newaxis]

@@ -94,58 +94,63 @@ def folder(
 
 
 def _stream(
-    robot: str,
-    place: File,
-    world: FolderWorld,
-    clocks: Mapping[str, int],
-    classes: Sequence[str],
+    robot: str, place: File, world: FolderWorld, clocks: Mapping[str, int], classes: Sequence[str]
 ) -> RobotStream:
-    odometry, observed, sighted, fixed, truth, start = (
-        _table(place, kind, robot)
-        for kind in ("odometry", "observations", "sightings", "fixes", "truth", "start")
-    )
-    intervals, notes = intervals_of(odometry, clocks[robot])
+    kinds = ("odometry", "observations", "sightings", "fixes", "truth", "start")
+    tables = {kind: _table(place, kind, robot) for kind in kinds}
+    unnamed = detections_of(place, robot, classes)
+    stream = stream_of(robot, tables, tuple(clocks), clocks[robot], unnamed)
+    return replace(stream, start=None) if starts_unknown(world, robot) else stream
+
+
+def stream_of(
+    robot: str,
+    tables: Mapping[str, CsvTable | None],
+    team: tuple[str, ...],
+    offset_ns: int = 0,
+    unnamed: Detections | None = None,
+) -> RobotStream:
+    """Measurements of a robot's tables by kind; offset_ns: of the odometry's clock."""
+    intervals, notes = intervals_of(tables.get("odometry"), offset_ns)
     driven = None
     if len(intervals.end_ns):
         driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
     else:
         notes.append("no odometry: only its observations are used")
+    observed, sighted = tables.get("observations"), tables.get("sightings")
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
-    unnamed = detections_of(place, robot, classes)
     if unnamed is not None and driven is not None:
         unnamed = unnamed.within(*driven)
     if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")
-    teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, tuple(clocks)), driven)
+    teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, team), driven)
     notes += more
-    fixes_ns, fixes, more = rows.fixes_of(fixed, driven)
+    fixes_ns, fixes, more = rows.fixes_of(tables.get("fixes"), driven)
     notes += more
     saw = len(seen.stamps_ns) or len(teammates.stamps_ns) or unnamed is not None
     if driven is None and not saw:
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
-    truth_ns, poses, more = rows.truth_of(truth, driven)
+    truth_ns, poses, more = rows.truth_of(tables.get("truth"), driven)
     notes += more if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
-    pose = None if start is None else rows.start_of(start)
-    landmarks, mates = (
-        merge_detections(_insert_empty(seen.grouped(), empty_ns), unnamed),
-        teammates.grouped(),
-    )
+    start = tables.get("start")
+    landmarks = merge_detections(_insert_empty(seen.grouped(), empty_ns), unnamed)
+    mates = teammates.grouped()
     begins = (np.array(driven or (), np.int64), landmarks.stamps_ns[:1], mates.stamps_ns[:1])
     return RobotStream(
         robot=robot,
         start_ns=int(np.concatenate(begins).min()),
-        start=None if starts_unknown(world, robot) else pose,
+        start=None if start is None else rows.start_of(start),
         intervals=intervals,
         landmark_detections=landmarks,
         teammate_detections=mates,
-        teammates=tuple(clocks),
+        teammates=team,
         truth_ns=truth_ns if len(poses) else None,
         truth=poses if len(poses) else None,
         notes=tuple(notes),
         fixes_ns=fixes_ns,
         fixes=fixes,
-        clock_offset_ns=clocks[robot],
+        clock_offset_ns=offset_ns,
     )
 
 

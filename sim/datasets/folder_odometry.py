@@ -196,18 +196,17 @@ def _covariances_of(
     matrices = pose_covariances(table)
     given = ~np.isnan(matrices[:, 0, 0])
     of_motions = given if form != STEERED else _find_filled(table, INCREMENTS)
-    for row in np.flatnonzero(given & ~of_motions)[:1].tolist():
-        raise table.error(
-            row,
-            "c_xx",
-            f"covariances come with {','.join(SPEEDS)} or {','.join(POSES)} or "
-            f"{','.join(INCREMENTS)}; a car's noise stands in the scenario",
-        )
+    table.refuse(
+        given & ~of_motions,
+        "c_xx",
+        f"covariances come with {','.join(SPEEDS)} or {','.join(POSES)} or "
+        f"{','.join(INCREMENTS)}; a car's noise stands in the scenario",
+    )
     least = np.linalg.eigvalsh(np.where(given[:, np.newaxis, np.newaxis], matrices, np.eye(3)))
-    for row in np.flatnonzero(least[used, 0] <= 0.0)[:1].tolist():
-        raise table.error(row + (used.start or 0), "c_xx", NOT_A_COVARIANCE)
-    without = np.zeros(len(table), np.bool_)
-    without[used] = ~given[used]
+    taken = np.zeros(len(table), np.bool_)
+    taken[used] = True
+    table.refuse(taken & (least[:, 0] <= 0.0), "c_xx", NOT_A_COVARIANCE)
+    without = taken & ~given
     rows.note(without, "without a covariance, as others have: the scenario's noise holds for it")
     return matrices[used]
 
@@ -222,8 +221,7 @@ def _judge_durations(rows: Rows, duration: Int64[np.ndarray, " N"]) -> None:
     if not rows.table.has("duration_s"):
         return
     stated = rows.table.stamps("duration_s")
-    for row in np.flatnonzero(stated <= 0)[:1].tolist():
-        raise rows.table.error(row, "duration_s", "not above 0")
+    rows.table.refuse(stated <= 0, "duration_s", "not above 0")
     off = np.abs(stated - duration) > np.maximum(OFF_NS, duration // 100)
     rows.note(
         off, "whose duration_s is not the time since the row before: it is taken to last as long"

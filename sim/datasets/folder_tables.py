@@ -227,8 +227,8 @@ def _own(
     for columns in whole:
         given = covariances_of(table, columns)
         own = as_points if columns == POINT_COVARIANCE else ~as_points
-        for row in np.flatnonzero(~np.isnan(given[:, 0]) & ~own)[:1].tolist():
-            raise table.error(row, columns[0], "a covariance of the form that is not in this row")
+        stray = ~np.isnan(given[:, 0]) & ~own
+        table.refuse(stray, columns[0], "a covariance of the form that is not in this row")
         claimed[own] = given[own]
     unclaimed = np.isnan(claimed[:, 0])
     rows.note(unclaimed, "without a covariance, as others have: the sensor's noise holds for it")
@@ -257,13 +257,12 @@ def fixes_of(
             )
         stated = covariances_of(rows.table, POINT_COVARIANCE)
         xx, xy, yy = stated.T
-        for row in np.flatnonzero(~np.isnan(xx) & ~((xx > 0.0) & (xx * yy > xy * xy)))[:1].tolist():
-            raise rows.table.error(
-                row,
-                "c_xx",
-                "its covariance is not positive definite; leave its cells empty where none is "
-                "known, and gnss.sigma_m holds",
-            )
+        rows.table.refuse(
+            ~np.isnan(xx) & ~((xx > 0.0) & (xx * yy > xy * xy)),
+            "c_xx",
+            "its covariance is not positive definite; leave its cells empty where none is known, "
+            "and gnss.sigma_m holds",
+        )
     return rows.stamps_ns, np.hstack((rows.table.numbers(*POINTS), stated)), rows.notes
 
 

@@ -13,18 +13,9 @@ import numpy as np
 import tomli_w
 
 from teamslam.sim.datasets.csv_table import CsvTable
+from teamslam.sim.datasets.folder import stream_of
 from teamslam.sim.datasets.folder_files import ONE_ROBOT, ROBOT_NAME, SCENARIO, robots_of
-from teamslam.sim.datasets.folder_odometry import intervals_of
-from teamslam.sim.datasets.folder_tables import (
-    POINTS,
-    POLAR,
-    POSES,
-    check_polar,
-    fixes_of,
-    measurements_of,
-    start_of,
-    truth_of,
-)
+from teamslam.sim.datasets.folder_tables import POINTS, POLAR, POSES, check_polar
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.graph import is_graph
 from teamslam.sim.datasets.kinds import kind_of
@@ -468,19 +459,10 @@ def check_sources(robots: Iterable[RobotTables]) -> None:
     """
     for robot in robots:
         tables = {kind: table for kind, table in robot.sources.items() if len(table)}
-        intervals, _ = intervals_of(tables.get("odometry"), 0)
-        driven = None
-        if len(intervals.end_ns):
-            driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
-        measurements_of(tables.get("observations"), "measurement", None, driven)
-        sighted = tables.get("sightings")
-        if sighted is not None:
-            mates = list(dict.fromkeys(sighted.columns["teammate"]))
-            measurements_of(sighted, "sighting", (robot.robot, mates), driven)
-        fixes_of(tables.get("fixes"), driven)
-        truth_of(tables.get("truth"), driven)
-        if (start := tables.get("start")) is not None:
-            start_of(start)
+        if not tables.keys().isdisjoint(("odometry", "observations")):
+            sighted = tables.get("sightings")
+            mates = () if sighted is None else sighted.columns["teammate"]
+            stream_of(robot.robot, tables, tuple(dict.fromkeys([robot.robot, *mates])))
         _check_detections(tables.get("detections"))
 
 
