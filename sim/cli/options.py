@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import click
 
-from teamslam.sim.cli.commands import argument, network, option, rare, refuse, refusing
+from teamslam.sim.cli.commands import argument, fail, network, option, rare, refuse, refusing
 from teamslam.sim.scenarios.checks import ScenarioError
 from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
@@ -200,6 +200,15 @@ def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
     if len(found) > MOST_HOLES:
         more = count_noun(len(found) - MOST_HOLES, "more finding")
         click.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
+
+
+def fail_if_cut(log: "Log", thing: str) -> None:
+    """Fail for a log whose end is missing."""
+    if not log.complete:
+        fail(
+            f"{log.path} is cut, so the {thing} is of the part before the cut: `teamslam repair "
+            f"{log.path} -o FIXED.mcap` completes the log"
+        )
 
 
 def set_aside(file: Path) -> Path:

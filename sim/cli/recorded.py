@@ -21,7 +21,7 @@ from teamslam.sim.cli.commands import (
 from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 
 if TYPE_CHECKING:
-    from teamslam.team.recording.reader import Log
+    pass
 
 PICTURES = "Pictures for a paper or a talk"
 app = Group()
@@ -71,7 +71,9 @@ def replay(
             stop.wait(wait)
         count = replay_samples(bus, opened.samples(), pace, stop)
     click.echo(f"replayed {count} messages of {log}")
-    _hint_if_cut(opened)
+    if not opened.complete:
+        remedy = f"`teamslam repair {opened.path} -o FIXED.mcap` completes it"
+        click.echo(f"{opened.path} is cut: {remedy}", err=True)
 
 
 @app.declare(
@@ -155,11 +157,7 @@ def report(
     except OSError as error:
         fail(f"-o {output}: can not write: {error.strerror}; give another folder")
     opt.write_json(json_file, figures)
-    if not opened.complete:
-        fail(
-            f"{opened.path} is cut, so the report is of the part before the cut: `teamslam repair "
-            f"{opened.path} -o FIXED.mcap` completes the log"
-        )
+    opt.fail_if_cut(opened, "report")
 
 
 def _folder_of(log: Path) -> Path:
@@ -204,12 +202,6 @@ def repair(
     click.echo(f"{output}: {result.messages} messages{until}")
     for damage in result.damaged:
         click.echo(f"lost: {damage}", err=True)
-
-
-def _hint_if_cut(log: "Log") -> None:
-    if not log.complete:
-        remedy = f"`teamslam repair {log.path} -o FIXED.mcap` completes it"
-        click.echo(f"{log.path} is cut: {remedy}", err=True)
 
 
 FEWEST = 2

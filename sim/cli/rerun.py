@@ -230,11 +230,8 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         fail("the changed run ended without a final map")
     if failures := changed.failures:
         fail("; ".join(failures))
-    if isinstance(log, Log) and not log.complete:
-        fail(
-            f"{log.path} is cut, so the result is of the part before the cut: `teamslam repair "
-            f"{log.path} -o FIXED.mcap` completes the log"
-        )
+    if isinstance(log, Log):
+        opt.fail_if_cut(log, "result")
 
 
 def _write_run(
