@@ -270,7 +270,8 @@ def test_a_logs_configurations_with_former_names_are_read_with_todays():
     former = text.replace('"front_end":{', '"front_end":{"outlier_share":0.3,')
     assert former != text
     announced = build.configuration(configuration=former)
-    recorded = Recorded(configured={announced.node: announced})
+    recorded = Recorded()
+    recorded.configured[announced.node] = announced
     assert recorded.robot_config("r1") == (today, announced.digest)
 
 
