@@ -4,7 +4,6 @@ No estimate depends on a view, and verification skips it. Frames: `map` is the t
 `robot/<name>` a robot's; metres, radians, counter-clockwise; z = 0.
 """
 
-import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,11 +65,6 @@ class View:
         """Return the relative key, of one robot if it has a place for it."""
         return self.template.replace("{robot}", robot)
 
-    def is_of(self, key: str) -> bool:
-        """Return whether a relative key belongs to this view."""
-        pattern = re.escape(self.template).replace(r"\{robot\}", "[^/]+")
-        return re.fullmatch(pattern, key) is not None
-
 
 MAP = View("view/map", "foxglove.SceneUpdate", "1 Hz, when it has changed",
            "landmarks with 95 % ellipses, and the true ones")  # fmt: skip
@@ -97,7 +91,8 @@ def view_of(key: str) -> View | None:
     """Return the view of a relative key; None if there is none."""
     if VIEW.owner(key) is None:
         return None
-    return next((view for view in VIEWS if view.is_of(key)), None)
+    templates = key, key.rpartition("/")[0] + "/{robot}"
+    return next((view for view in VIEWS if view.template in templates), None)
 
 
 def json_schema(of: type[msgspec.Struct]) -> dict[str, Any]:
