@@ -64,10 +64,9 @@ OnOdometry = Callable[[int, tuple[float, float, float], str, str], None]
 class Ros2Driver:
     """Passes the publications on a robot's topics to its driver, in the order of their stamps.
 
-    taken: messages by topic; dropped: by reason; lost: published and never received. on_odometry:
-    called with each odometry pose and its frames. datum: origin of the plane of the team's fixes,
-    which are dropped without one. name, others: the robot's name, and the topics of the others in
-    the file, which may be its own, too.
+    taken: messages by topic; dropped: by reason; lost: published and never received. datum: origin
+    of the plane of the team's fixes, which are dropped without one. name, others: the robot's name,
+    and the topics of others, which may be its own, too.
     """
 
     def __init__(

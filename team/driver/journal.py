@@ -1,7 +1,7 @@
 """A driver's file of all measurements, in order of arrival, written before they are published.
 
-Append-only: a head (MessagePack), then records `<IBq` (payload length, kind, stamp [ns]), the
-payload (a measurement with number 0) and its CRC-32. An incomplete last record is removed.
+A head (MessagePack), then records: `<IBq` (payload length, kind, stamp [ns]), the payload (a
+measurement with number 0) and its CRC-32. An incomplete last record is removed.
 """
 
 import fcntl
@@ -33,8 +33,8 @@ Place = tuple[int, int]
 class Sorter:
     """Sort items by their places, with a bounded delay.
 
-    A camera's frame may arrive after the odometry of its time, so an item is held until one newer
-    by `latency_ns` has arrived. Its number depends on the order of the calls alone.
+    A camera's frame may arrive after the odometry of its time: an item is held until one newer by
+    `latency_ns` has arrived.
     """
 
     def __init__(self, latency_ns: int) -> None:
@@ -95,9 +95,8 @@ class Journal:
     incarnation: the one in progress; 0: none. delivered: every receiver has all of it. calls:
     offsets of all records but marks. driven_ns, pose: end of the last odometry interval, and the
     odometry pose there. cut: bytes behind the last whole record; is_damaged: they are no incomplete
-    record. clock: the wall clock at the last mark. team: "" in files of earlier versions. start:
-    pose and covariance of the first incarnation. run: the team's run that receives the stream; "":
-    none is known.
+    record. clock: the wall clock at the last mark. team: "" in files of earlier versions. run: that
+    receives the stream; "": unknown.
     """
 
     path: Path
@@ -287,11 +286,10 @@ def pose_payload(pose: tuple[float, float, float]) -> bytes:
 def open_journal(
     path: Path, robot: str, latency_ns: int, team: str = "", start: Start = (b"", b"")
 ) -> tuple[Journal, str, str]:
-    """Open a robot's journal; return it with a description of the stream that it continues or has
-    delivered, and one of a stream that is set aside undelivered.
+    """Open a robot's journal; describe the stream that it continues or has delivered, and one that
+    is set aside undelivered: old by OLD_S, or of another team or start.
 
-    A stream that is delivered, that has not grown for OLD_S, or that is of another team or start is
-    set aside. Raises JournalError for a file of another robot, of no driver, or in use.
+    Raises JournalError for a file of another robot, of no driver, or in use.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     journal = _lock_file(path, robot)

@@ -66,8 +66,7 @@ class Link:
         """Start the thread and wait for the router; raises BusError or KeysError after patience_s.
 
         0: log the first failure; a stream that a run has received waits for the first attempt,
-        since another run does not continue it. Returns a description of a stream that is set aside,
-        or "".
+        since another run does not continue it. Returns the description of one set aside, or "".
         """
         self._unheard = not patience_s
         self._attempt_s = patience_s or ATTEMPT_S

@@ -20,9 +20,8 @@ Pose = tuple[float, float, float]
 class Odometer:
     """State of the odometry: end of the last interval, and the odometry pose there if given.
 
-    speeds: forward [m/s] and yaw rate [rad/s] of the last interval; rates: its (ahead, left, turn)
-    per second. gap_ns: time before it without odometry. home: first pose. steps, fastest: number of
-    intervals and their highest speed [m/s].
+    speeds: its forward [m/s] and yaw rate [rad/s]; rates: its (ahead, left, turn) per second.
+    gap_ns: time before it without odometry. home: first pose. fastest: highest speed [m/s] so far.
     """
 
     robot: str

@@ -30,8 +30,8 @@ class SourceNode:
 
     An incarnation is published once the robot has consumed the one before. delivered, recorded:
     progress of robot and recorder. done: incarnation, measurements and submaps of the robot's
-    `Done`. joined: incarnation and submaps acknowledged by the centre. is_peer: the robot keeps a
-    set of its own. concluded: it has its final map. models: the robot's announced configuration.
+    `Done`. joined: submaps acknowledged by the centre. is_peer: the robot keeps a set of its own.
+    concluded: it has its final map. models: the robot's configuration.
     """
 
     def __init__(self, journal: Journal) -> None:

@@ -28,7 +28,7 @@ def cut(
 
     Times are seconds of team time since the first measurement; None: no bound. Earlier messages of
     `STANDING` channels are included. Raises `LogError`, before creating `out`, for an empty result
-    or a damaged log; `RecorderError` if `out` exists.
+    or a damaged log.
     """
     summary = summarise_log(log)
     if summary.damaged:

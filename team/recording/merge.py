@@ -24,9 +24,9 @@ class Merged(NamedTuple):
 def merge(logs: Sequence[Log], out: str | Path) -> Merged:
     """Write each sample once to a new log `out`, in order of team time, all in memory at once.
 
-    Samples of equal key, counter, wall clock and payload are one publication; measurements, submaps
-    and inter-robot measurements are compared by content. Raises `LogError`, before creating `out`,
-    for logs of different teams or a damaged one; `RecorderError` if `out` exists.
+    Equal key, counter, wall clock and payload are one publication; measurements, submaps and
+    inter-robot measurements are compared by content. Raises `LogError`, before creating `out`, for
+    logs of different teams or a damaged one.
     """
     first = logs[0]
     for log in logs[1:]:

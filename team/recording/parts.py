@@ -47,9 +47,8 @@ def check_continues(
 ) -> bool:
     """Return whether the run of the log continues; False: it has ended and only joining remains.
 
-    The same run has the same team and scenario and wrote within the hour, or before the wall clock
-    was set. same_run: skips the age test. ends: channels of the maps that end the team. Raises
-    `LogError` for any other log.
+    It has the same team and scenario and wrote within the hour (not asked of the same_run), or
+    before the wall clock was set. ends: maps that end the team. Raises `LogError` for another log.
     """
     parts = read_parts(path)
     remedy = "choose another name or remove it"

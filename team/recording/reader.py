@@ -63,9 +63,9 @@ class Channels:
 class Log:
     """A log on disk.
 
-    complete: its last recorder finished; an incomplete file is read up to its last whole chunk.
-    metadata: provenance. files: consecutive parts. declared: the last declaration read of each key.
-    reading: receives the share read in every pass.
+    complete: its last recorder finished; else it is read up to its last whole chunk. metadata:
+    provenance. files: consecutive parts. declared: the last declaration of each key. reading:
+    receives the share read in every pass.
     """
 
     path: Path

@@ -56,7 +56,7 @@ class RecordLoop:
 
     expected: nodes whose absence is a warning. inventory: of earlier parts. more: opens the next
     part after a write error, which is raised without it. peers: recording ends when each has
-    concluded, or was given up or withdrawn. The centre's final map ends any team.
+    concluded, or was given up or withdrawn, or with the centre's final map.
     """
 
     def __init__(

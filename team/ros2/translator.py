@@ -78,9 +78,8 @@ Measured = Pose | Speeds | Seen | Position
 class Translator:
     """Takes one robot's messages in order of arrival; counts those dropped, by reason.
 
-    mounts: the sensors' mounts by frame. antenna: its place (ahead, left) on the base. robot,
-    owners: its name among those that share its topics. datum: of fixes, which are dropped without
-    one.
+    mounts: of sensors by frame. antenna: its place (ahead, left) on the base. robot, owners: its
+    name among those that share its topics. datum: of fixes, which are dropped without one.
     """
 
     def __init__(

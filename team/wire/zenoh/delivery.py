@@ -1,8 +1,8 @@
 """Implement the deliveries of the table of channels by Zenoh's means.
 
 stream: a plain publisher. latest: a cache and heartbeats; a late joiner requests the newest sample,
-and after a cut or a drop the receiver requests the missed ones, as far back as the cache reaches.
-all: everything is cached, and a late joiner requests everything.
+and after a cut or a drop the missed ones, as far back as the cache reaches. all: everything is
+cached, and a late joiner requests it.
 """
 
 from collections.abc import Callable

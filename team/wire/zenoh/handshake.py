@@ -33,9 +33,9 @@ _NOT_TLS = ("WRONG_VERSION_NUMBER", "PACKET_LENGTH_TOO_LONG", "UNKNOWN_PROTOCOL"
 class Examined:
     """Result of one handshake.
 
-    refused: why there can be no link, with the remedy; None without evidence. waits_for: why there
-    is no link yet; empty after success. router_ends: expiry of the router's certificate [s since
-    1970]. accepts: connections are accepted, though perhaps not answered.
+    refused: why there can be no link, with the remedy. waits_for: why there is no link yet; empty
+    after success. router_ends: expiry of the router's certificate [s since 1970]. accepts:
+    connections are accepted, though perhaps not answered.
     """
 
     refused: str | None = None

@@ -112,9 +112,9 @@ def tls_settings(keys: "Credentials", role: Literal["connect", "listen"]) -> dic
 class RouterLink:
     """The link of one session to its router: logs why it is down; raises on evidence against it.
 
-    Silence never ends a process. Evidence is the result of a handshake (`handshake`), or the
-    router's statement that its roster lacks our certificate: Zenoh connects a revoked one and drops
-    its messages silently, so that query follows each new link.
+    Evidence is the result of a handshake (`handshake`), or the router's statement that its roster
+    lacks our certificate: Zenoh connects a revoked one and drops its messages silently, so that
+    query follows each new link. Silence never ends a process.
     """
 
     def __init__(self, session: zenoh.Session, connect: str, keys: "Credentials | None") -> None:

@@ -1,9 +1,9 @@
 """Samples of a team that a router stores for absent processes: ends and orders.
 
-A stored sample keeps its key, bytes and attachment, and thereby its author; an end replaces only an
-end of the same author, and is sent to a node that was in that run and never announced its end
-(`Tally`), until one of its processes does. Orders are valid until the centre's final map, or until
-no process of the team is present.
+A stored sample keeps its key, bytes and attachment, and thereby its author. An end replaces one of
+the same author, and is sent to a node that was in that run and never announced its end (`Tally`),
+until one of its processes does. Orders are valid until the centre's final map, or until no process
+of the team is present.
 """
 
 import threading
