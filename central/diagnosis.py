@@ -20,22 +20,10 @@ from teamslam.team.config import MAP, UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Contribution, Stream, moment, named, part_of
 from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, information
+from teamslam.team.estimation.map_joining import hypotheses, marginals
 from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
-from teamslam.team.estimation.map_joining.hypotheses import (
-    CARRIED_OFF,
-    MOVED,
-    SHARED,
-    Hypothesis,
-    explain,
-)
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import points_of
-from teamslam.team.estimation.map_joining.marginals import (
-    BiasEstimate,
-    scatter_of,
-    terms,
-    unbounded_costs,
-)
 from teamslam.team.estimation.se2 import Pose, wrapped
 from teamslam.team.wire import messages as m
 
@@ -120,7 +108,7 @@ _ERRORS: Mapping[str, _SharedError] = {
 
 def diagnose(
     fold: Fold,
-    biases: Sequence[BiasEstimate],
+    biases: Sequence[marginals.BiasEstimate],
     withdrawn: Mapping[str, Sequence[Contribution]],
     normal: float,
     scale: float,
@@ -139,7 +127,7 @@ def diagnose(
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
     try:
-        accepted, island = explain(fold.main)
+        accepted, island = hypotheses.explain(fold.main)
     except UNSOLVABLE:
         accepted = []
     else:
@@ -157,7 +145,7 @@ def diagnose(
             for each in accepted
             if each.subject not in mirrored and not _is_bent(each, shared)
         ]
-        costs = unbounded_costs(island) if final else terms(island).submaps
+        costs = marginals.unbounded_costs(island) if final else marginals.terms(island).submaps
         left = find_misscaled(costs, normal, final=final)
         noise = [_noise(*each) for each in left if each.robot not in mirrored]
     found += _wrong_minimum(fold)
@@ -209,12 +197,12 @@ def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
     return gap, float(dense.product(dense.product(gap, metric), gap))
 
 
-def _is_start(found: Hypothesis | m.Diagnosis) -> bool:
+def _is_start(found: hypotheses.Hypothesis | m.Diagnosis) -> bool:
     """Whether a jump is an error of an initial pose: it has no time."""
-    return found.cause == CARRIED_OFF and not found.at_ns
+    return found.cause == hypotheses.CARRIED_OFF and not found.at_ns
 
 
-def _start_remedy(fold: Fold, found: Hypothesis) -> str:
+def _start_remedy(fold: Fold, found: hypotheses.Hypothesis) -> str:
     own = fold.main.graph.streams
     others = {each for each in fold.starts if each in own and each[0] != found.subject}
     if len(others) != 1:
@@ -223,23 +211,23 @@ def _start_remedy(fold: Fold, found: Hypothesis) -> str:
     return START_REMEDY + OTHER_START.format(other=named(other).removesuffix(" (incarnation 1)"))
 
 
-def _is_bent(jump: Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
+def _is_bent(jump: hypotheses.Hypothesis, shared: Sequence[m.Diagnosis]) -> bool:
     """Whether an apparent jump has less evidence than a shared error, as of a late clock."""
-    if jump.cause != CARRIED_OFF:
+    if jump.cause != hypotheses.CARRIED_OFF:
         return False
     evidence = jump.evidence / jump.dof
     return any(each.robot == jump.subject and each.evidence > evidence for each in shared)
 
 
 _REMEDIES: Mapping[str, str] = {
-    MOVED: "remove the landmark, or give it another number from that time on",
-    SHARED: "give each of the two landmarks a number of its own",
-    CARRIED_OFF: REMEDY,
+    hypotheses.MOVED: "remove the landmark, or give it another number from that time on",
+    hypotheses.SHARED: "give each of the two landmarks a number of its own",
+    hypotheses.CARRIED_OFF: REMEDY,
 }
 
 
 def _shared_errors(
-    fold: Fold, biases: Sequence[BiasEstimate], scale: float
+    fold: Fold, biases: Sequence[marginals.BiasEstimate], scale: float
 ) -> Iterator[m.Diagnosis]:
     """Find errors that differ from the robot's configuration beyond doubt.
 
@@ -252,7 +240,7 @@ def _shared_errors(
         error, sigma = _ERRORS.get(bias), stated * math.sqrt(max(scale, 1.0))
         if error is None or sigma == 0.0 or abs(value) <= max(error.least, SIGMAS * sigma):
             continue
-        scatter = scatter_of(fold, found)
+        scatter = marginals.scatter_of(fold, found)
         sigma = max(sigma, scatter.sigma)
         if abs(value) > max(
             SIGMAS * sigma, _student(SCALE_SIGMAS, scatter.freedom) * scatter.sigma
@@ -450,9 +438,9 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
     """Make the JSON object of a cause; `value`: a number, or [dx, dy]."""
     values: list[object] = []
     for numbers in (found.value, found.sigma):
-        if found.cause == MOVED:
+        if found.cause == hypotheses.MOVED:
             values.append(list(numbers))
-        elif found.cause in (SHARED, CARRIED_OFF) and numbers:
+        elif found.cause in (hypotheses.SHARED, hypotheses.CARRIED_OFF) and numbers:
             values.append(math.hypot(*numbers[:2]))
         else:
             values.append(numbers[0] if numbers else None)
@@ -461,7 +449,7 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
     more: dict[str, object] = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
     if found.place:
         more["place"] = list(found.place)
-    if found.cause in (SHARED, CARRIED_OFF):
+    if found.cause in (hypotheses.SHARED, hypotheses.CARRIED_OFF):
         more["displacement"] = list(found.value)
     return {
         "cause": found.cause,

@@ -18,6 +18,7 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.survey import station, survey_of
 from teamslam.team import translate
 from teamslam.team.config import GNSS, SURVEY
+from teamslam.team.estimation import plausibility
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.contribution import (
     NO_OWN,
@@ -30,12 +31,6 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.inter_robot import InterRobotFactor
 from teamslam.team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
-from teamslam.team.estimation.plausibility import (
-    sighting_beyond,
-    start_beyond,
-    submap_beyond,
-    with_least_spread,
-)
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import Digest, digest_of
 from teamslam.team.wire.messages import MOST_SAVED, SightingFactor, Submap
@@ -176,7 +171,7 @@ class FoldInputs:
                 factor = self._config.covariance_factor
                 local = replace(local, covariance=local.covariance / factor)
             else:
-                local = with_least_spread(local, self._config.least_sigma)
+                local = plausibility.with_least_spread(local, self._config.least_sigma)
                 if local is not found.local:
                     self._raised.add(key)
             found = found if local is found.local else replace(found, local=local)
@@ -197,7 +192,7 @@ class FoldInputs:
 
     def _beyond(self, submap: Contribution) -> str | None:
         bounds = self._bounds_of_map if is_map(submap.stream) else self._config.bounds
-        return submap_beyond(submap.local, bounds)
+        return plausibility.submap_beyond(submap.local, bounds)
 
     def tick(self, tick: int, without: Collection[str]) -> Tick:
         """Return the members of a tick without some robots, and those refused beyond the bounds."""
@@ -212,7 +207,7 @@ class FoldInputs:
         starts = []
         first = (m.stream for m in submaps if m.sequence == 0 and m.stream in self._starts)
         for start in (self._starts[stream] for stream in first):
-            why = start_beyond(start, self._config.bounds)
+            why = plausibility.start_beyond(start, self._config.bounds)
             if why is None:
                 starts.append(start)
             else:
@@ -232,7 +227,7 @@ class FoldInputs:
         for sighting in (each for key in order for each in self._filed[key].sightings):
             if sighting.teammate in without:
                 continue
-            why = sighting_beyond(sighting, self._config.bounds)
+            why = plausibility.sighting_beyond(sighting, self._config.bounds)
             if why is None:
                 sightings.append(sighting)
             else:

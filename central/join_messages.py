@@ -17,19 +17,8 @@ from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.verification import find_possible_duplicates
 from teamslam.team.estimation.contribution import Stream, first_of, is_map, named, whole_of
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
-from teamslam.team.estimation.map_joining import landmark_view, marginals
+from teamslam.team.estimation.map_joining import distinctness, landmark_view, marginals
 from teamslam.team.estimation.map_joining.alignment import NEEDED, SharedPoints
-from teamslam.team.estimation.map_joining.distinctness import (
-    OdometryTie,
-    Repetition,
-    find_disagreeing,
-    find_lost_streams,
-    find_missed,
-    find_odometry_ties,
-    find_parts,
-    find_repetitions,
-    find_weakly_placed,
-)
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
@@ -85,8 +74,8 @@ class Shown(NamedTuple):
     weak: Sequence[int] = ()
     missed: Sequence[int] = ()
     headings: Mapping[Stream, float] = MappingProxyType({})
-    repeated: Sequence[Repetition] = ()
-    tied: Sequence[OdometryTie] = ()
+    repeated: Sequence[distinctness.Repetition] = ()
+    tied: Sequence[distinctness.OdometryTie] = ()
 
 
 def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
@@ -99,22 +88,26 @@ def shown_landmarks(fold: Fold, config: CentralConfig, tail: Tail) -> Shown:
     least = min(CONFIRMED_BY, most)
     ids = marginals.confirmed(fold, config.landmark_submaps, least)
     if not fold.condensed_count:
-        ids = sorted({*ids}.difference(find_disagreeing(fold, ids, least)))
+        ids = sorted({*ids}.difference(distinctness.find_disagreeing(fold, ids, least)))
     unnamed = [id_ for id_ in ids if id_ >= UNNAMED]
     if not unnamed:
         return Shown(ids)
-    weak = find_weakly_placed(fold.main, unnamed)
-    seldom = find_missed(fold, {*unnamed} - {*weak})
+    weak = distinctness.find_weakly_placed(fold.main, unnamed)
+    seldom = distinctness.find_missed(fold, {*unnamed} - {*weak})
     out, view = {*weak, *seldom}, view_island(fold.main, fold.landmarks)
     unnamed = [id_ for id_ in unnamed if id_ not in out]
-    parts = find_parts(fold.main) if not fold.condensed_count else {}
+    parts = distinctness.find_parts(fold.main) if not fold.condensed_count else {}
     undecided = find_possible_duplicates(view, unnamed, parts)
     left = [id_ for id_ in ids if id_ not in out | {*undecided}]
-    repeated = find_repetitions(fold.main, left)
+    repeated = distinctness.find_repetitions(fold.main, left)
     copies = {id_ for each in repeated for id_ in each.ids}
     left = [id_ for id_ in left if id_ not in copies]
-    lost = find_lost_streams(fold.main)
-    tied = find_odometry_ties(fold.main, left, undecided) if not fold.condensed_count else []
+    lost = distinctness.find_lost_streams(fold.main)
+    tied = (
+        distinctness.find_odometry_ties(fold.main, left, undecided)
+        if not fold.condensed_count
+        else []
+    )
     return Shown(left, undecided, weak, seldom, lost, repeated, tied)
 
 

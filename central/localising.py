@@ -16,38 +16,31 @@ from teamslam.team.config import UNNAMED
 from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import Stream, is_map
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
+from teamslam.team.wire import arrays
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import (
-    derivatives,
-    floats,
-    from_derivatives,
-    from_floats,
-    from_ids,
-    ids,
-)
 
 
 def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
     """Leave out the named landmarks of a submap that no saved map has."""
-    numbers = ids(submap.ids, "ids")
-    known = [ids(each.ids, "ids") for each in maps]
+    numbers = arrays.ids(submap.ids, "ids")
+    known = [arrays.ids(each.ids, "ids") for each in maps]
     keep = (numbers >= UNNAMED) | np.isin(numbers, np.concatenate([numbers[:0], *known]))
     if keep.all() or is_map((submap.robot, submap.incarnation)):
         return submap
-    mean = floats(submap.mean, "mean")
+    mean = arrays.floats(submap.mean, "mean")
     poses = len(mean) - 2 * len(numbers)
     rows = np.flatnonzero(np.concatenate([np.ones(poses, np.bool_), np.repeat(keep, 2)]))
-    P = unpacked(floats(submap.covariance, "covariance"), len(mean))
+    P = unpacked(arrays.floats(submap.covariance, "covariance"), len(mean))
 
     def kept(data: bytes, count: int, what: str) -> bytes:
-        found = derivatives(data, len(mean) * count, what).reshape(count, len(mean))
-        return from_derivatives(found[:, rows])
+        found = arrays.derivatives(data, len(mean) * count, what).reshape(count, len(mean))
+        return arrays.from_derivatives(found[:, rows])
 
     return msgspec.structs.replace(
         submap,
-        ids=from_ids(numbers[keep]),
-        mean=from_floats(mean[rows]),
-        covariance=from_floats(packed(P[np.ix_(rows, rows)])),
+        ids=arrays.from_ids(numbers[keep]),
+        mean=arrays.from_floats(mean[rows]),
+        covariance=arrays.from_floats(packed(P[np.ix_(rows, rows)])),
         sensitivity=kept(submap.sensitivity, len(submap.biases), "sensitivity"),
         curvature=kept(submap.curvature, int(bool(submap.curvature)), "curvature"),
     )
@@ -76,9 +69,9 @@ def seeks_saved_map(fold: Fold, stream: Stream) -> bool:
 
 def saved_landmarks(fused: m.FusedMap, saved: m.SavedMap) -> m.FusedMap:
     """Replace the landmarks of a team's map by those saved."""
-    n = len(ids(saved.ids, "ids"))
+    n = len(arrays.ids(saved.ids, "ids"))
     joint = fused.final and n <= JOINT_LANDMARKS
-    P = unpacked(floats(saved.covariance, "covariance"), 2 * n)
+    P = unpacked(arrays.floats(saved.covariance, "covariance"), 2 * n)
     return msgspec.structs.replace(
         fused,
         frame=translate.frame_name(saved.author, 0),

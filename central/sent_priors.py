@@ -12,12 +12,8 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation.contribution import Stream
+from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.marginals import (
-    LandmarkBlocks,
-    landmark_blocks,
-    last_pose,
-)
 from teamslam.team.shapes import Float, Int64, UInt32
 
 EVERY = 8
@@ -42,7 +38,7 @@ class _Sent:
     broadcasts. alone: without a pose.
     """
 
-    blocks: LandmarkBlocks
+    blocks: marginals.LandmarkBlocks
     ids: UInt32[np.ndarray, " L"]
     encounter_ns: int
     since: int
@@ -79,13 +75,13 @@ class SentPriors:
         out = self._withdrawn({*streams} - {*inside})
         if not inside:
             return out
-        blocks, newest = landmark_blocks(fold, shown), _newest_encounters(fold)
+        blocks, newest = marginals.landmark_blocks(fold, shown), _newest_encounters(fold)
         return out + [
             each
             for each in inside
             if self.is_worth(
                 each,
-                None if each in alone else last_pose(fold, fold.latest_part(each)),
+                None if each in alone else marginals.last_pose(fold, fold.latest_part(each)),
                 blocks,
                 newest.get(each[0], NEVER),
                 fold.frame,
@@ -111,7 +107,7 @@ class SentPriors:
         self,
         stream: Stream,
         pose: Float[np.ndarray, "3"] | None,
-        blocks: LandmarkBlocks,
+        blocks: marginals.LandmarkBlocks,
         encounter_ns: int = NEVER,
         frame: Stream | None = None,
     ) -> bool:
@@ -142,7 +138,9 @@ def _newest_encounters(fold: Fold) -> dict[str, int]:
     return newest
 
 
-def _has_changed(old: _Sent, now: LandmarkBlocks, needed: Int64[np.ndarray, " k"]) -> bool:
+def _has_changed(
+    old: _Sent, now: marginals.LandmarkBlocks, needed: Int64[np.ndarray, " k"]
+) -> bool:
     ids = now.ids[needed]
     if not len(needed):
         return False

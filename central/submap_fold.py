@@ -7,36 +7,15 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import NamedTuple
 
+from teamslam.central import join_messages, localising, unnamed_landmarks
 from teamslam.central.config import CentralConfig
 from teamslam.central.diagnosis import describe, diagnose, widening
 from teamslam.central.fused_map import JOINT_LANDMARKS, receivable, version_entry
-from teamslam.central.join_messages import (
-    PRIOR_LANDMARKS,
-    Tail,
-    encoded_landmarks,
-    gets_landmarks_alone,
-    priors,
-    reasons,
-    shown_landmarks,
-    trajectories,
-)
-from teamslam.central.localising import (
-    in_saved_map,
-    restricted,
-    saved_landmarks,
-    seeks_saved_map,
-)
 from teamslam.central.monitor import monitor_figures
 from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.survey import datum_of
 from teamslam.central.tick_fold import TickFold
-from teamslam.central.unnamed_landmarks import (
-    decisions_of,
-    judgement_of,
-    memberships_of,
-    verdict_of,
-)
 from teamslam.team import translate
 from teamslam.team.config import MAP
 from teamslam.team.estimation.contribution import NO_OWN, is_map, whole_of
@@ -88,7 +67,7 @@ class SubmapFold:
         self._judged = 0
         self._accused: Mapping[str, str] = {}
         self._apart: Mapping[str, Fold] = {}
-        self._sent_priors = SentPriors(PRIOR_LANDMARKS)
+        self._sent_priors = SentPriors(join_messages.PRIOR_LANDMARKS)
         self._final: tuple[Fold, m.FusedMap] | None = None
 
     def fold_until(self, closed_ns: float) -> None:
@@ -98,7 +77,7 @@ class SubmapFold:
 
     def make_map(
         self,
-        tail: Tail,
+        tail: join_messages.Tail,
         closed_ns: float = math.inf,
         *,
         ahead: bool = True,
@@ -150,7 +129,7 @@ class SubmapFold:
             ticks.withdraw_robot(robot)
         if store.judged != self._judged:
             self._judged = store.judged
-            ticks.set_verdicts({verdict_of(each) for each in store.verdicts})
+            ticks.set_verdicts({unnamed_landmarks.verdict_of(each) for each in store.verdicts})
         chains = store.chains
         for stream in sorted(
             s for s, chain in chains.items() if len(chain) > self._filed.get(s, 0)
@@ -166,7 +145,7 @@ class SubmapFold:
                 sightings = store.sightings(submap)
                 named = (submap, saved) if own.errors and saved else (submap, *sightings)
                 digest = digest_of(*map(encoded, named))
-                taken = restricted(submap, store.maps.values()) if localises else submap
+                taken = localising.restricted(submap, store.maps.values()) if localises else submap
                 ticks.add_submap(taken, digest, sightings, own)
                 self._filed[stream] = submap.sequence + 1
 
@@ -214,7 +193,7 @@ class SubmapFold:
         return (*suspended, *undecided, *repeated, *raised, *self.reasons)
 
     def _messages(
-        self, ticks: TickFold, fold: Fold, tail: Tail, recorded: RecordedFields | None
+        self, ticks: TickFold, fold: Fold, tail: join_messages.Tail, recorded: RecordedFields | None
     ) -> list[Outgoing]:
         final = tail == "final"
         digest = ticks.digest(fold, self.config_digest, tail.encode())
@@ -227,13 +206,13 @@ class SubmapFold:
         scale = max(figures.get(name, 1.0) for name in ("covariance_scale", "joint_cost_per_dof"))
         members = ticks.members(fold)
         if self.config.localise:
-            fold = in_saved_map(fold)
-        shown = shown_landmarks(fold, self.config, tail)
+            fold = localising.in_saved_map(fold)
+        shown = join_messages.shown_landmarks(fold, self.config, tail)
         withdrawn = ticks.submaps_of_withdrawn()
         self.diagnosis = diagnose(
             fold, biases, withdrawn, self.config.normal_scale, scale, final=final
         )
-        self.reasons = reasons(
+        self.reasons = join_messages.reasons(
             fold,
             shown,
             biases,
@@ -244,7 +223,7 @@ class SubmapFold:
             fold = marginals.widen_covariances(fold, widening(self.diagnosis))
             biases = marginals.bias_estimates(fold)
         joint = final and len(shown.ids) <= JOINT_LANDMARKS and bool(fold.contributions)
-        ids, means, covariance = encoded_landmarks(fold, shown.ids, joint=joint)
+        ids, means, covariance = join_messages.encoded_landmarks(fold, shown.ids, joint=joint)
         store, left_out = self.store, [x for each in withdrawn.values() for x in each]
         last_of = {x.stream: x.sequence for x in left_out}
         fused = m.FusedMap(
@@ -281,19 +260,21 @@ class SubmapFold:
             withdrawn=ticks.withdrawn,
             covariance_scale=figures.get("covariance_scale", 0.0),
             heard=store.arrived if recorded is None else recorded.arrived,
-            memberships=memberships_of(fold.landmarks, final) if fold.has_unnamed else (),
-            decisions=decisions_of(fold.landmarks) if fold.has_unnamed else (),
-            verdicts=tuple(map(judgement_of, fold.landmarks.verdicts)),
+            memberships=unnamed_landmarks.memberships_of(fold.landmarks, final)
+            if fold.has_unnamed
+            else (),
+            decisions=unnamed_landmarks.decisions_of(fold.landmarks) if fold.has_unnamed else (),
+            verdicts=tuple(map(unnamed_landmarks.judgement_of, fold.landmarks.verdicts)),
             changes=landmark_changes(fold, shown.ids) if final else (),
         )
         if self.config.localise and (saved := min(store.maps.items(), default=None)) is not None:
-            fused = saved_landmarks(fused, saved[1])
+            fused = localising.saved_landmarks(fused, saved[1])
         self._final = (fold, fused) if final else None
         self.landmarks = len(shown.ids)
         self.not_folded = len(fold.refused) + len(fold.set_aside)
         of_robots = self._receivable(self._priors(fold, fused, shown.ids, recorded))
         if final:
-            paths = self._receivable(trajectories(fold, digest, store.chains))
+            paths = self._receivable(join_messages.trajectories(fold, digest, store.chains))
             return [*of_robots, *paths, Outgoing(ch.FINAL_MAP, "", receivable(fused))]
         return [Outgoing(ch.FUSED_MAP, "", receivable(fused)), *of_robots]
 
@@ -311,23 +292,27 @@ class SubmapFold:
         streams = self._latest_streams(fused) if recorded is None else sorted(recorded.priors_of)
         parts = [(fold, shown, [each for each in streams if each[0] not in self._apart])]
         for robot, own in self._apart.items():
-            ids = shown_landmarks(own, self.config, "closed").ids
+            ids = join_messages.shown_landmarks(own, self.config, "closed").ids
             parts.append((own, ids, [each for each in streams if each[0] == robot]))
-        seekers = [s for s in parts[0][2] if fold.has_maps and seeks_saved_map(fold, s)]
+        seekers = [s for s in parts[0][2] if fold.has_maps and localising.seeks_saved_map(fold, s)]
         if seekers:
             parts[0] = (fold, shown, [each for each in parts[0][2] if each not in seekers])
-            of_map = in_saved_map(fold)
-            parts.append((of_map, shown_landmarks(of_map, self.config, "closed").ids, seekers))
+            of_map = localising.in_saved_map(fold)
+            parts.append(
+                (of_map, join_messages.shown_landmarks(of_map, self.config, "closed").ids, seekers)
+            )
         for of, ids, requested in parts:
             if recorded is None:
                 news = self._sent_priors
-                alone = [s for s in requested if gets_landmarks_alone(of, ids, fused, s)]
+                alone = [
+                    s for s in requested if join_messages.gets_landmarks_alone(of, ids, fused, s)
+                ]
                 requested = (
                     news.void(of, requested)
                     if fused.final
                     else news.worth(of, requested, ids, alone)
                 )
-            out += priors(of, ids, fused, requested)
+            out += join_messages.priors(of, ids, fused, requested)
         return out
 
     def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:

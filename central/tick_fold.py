@@ -24,39 +24,17 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
+from teamslam.central import withdrawal
 from teamslam.central.checkpoints import Checkpoints
 from teamslam.central.config import CentralConfig
 from teamslam.central.fold_inputs import FoldInputs
-from teamslam.central.withdrawal import (
-    LEAST_SUBMAPS,
-    Conviction,
-    Suspension,
-    Trial,
-    disagreement,
-    find_suspects,
-    hold_trial,
-)
 from teamslam.team.config import BIASES
+from teamslam.team.estimation import contribution
 from teamslam.team.estimation.association.landmark_sets import Verdict
-from teamslam.team.estimation.contribution import (
-    NO_OWN,
-    Contribution,
-    OwnBiases,
-    Stream,
-    is_absolute,
-    whole_of,
-)
-from teamslam.team.estimation.map_joining import marginals
+from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
 from teamslam.team.estimation.map_joining.continuity import Seam
-from teamslam.team.estimation.map_joining.joining import (
-    EMPTY_FOLD,
-    Fold,
-    InitialPoseFactor,
-    JoinSettings,
-    solve_fold,
-)
 from teamslam.team.estimation.map_joining.late_seams import find_late_seam
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
@@ -77,9 +55,9 @@ the running fold.
 """
 
 
-def join_settings(config: CentralConfig) -> JoinSettings:
+def join_settings(config: CentralConfig) -> joining.JoinSettings:
     """Return a centre's settings of the join."""
-    return JoinSettings(
+    return joining.JoinSettings(
         iterations_per_tick=config.gauss_newton_per_tick,
         covariance_factor=config.covariance_factor,
         bias_sigma={bias: getattr(config.bias_sigma, bias) for bias in BIASES},
@@ -117,21 +95,21 @@ class TickFold:
         self._ordered: frozenset[str] = frozenset()
         self.agreement = agreement = lru_cache(maxsize=1)(marginals.joint_cost)
         self.disagreement = lru_cache(maxsize=1)(
-            lambda fold: disagreement(agreement(fold), least=1)
+            lambda fold: withdrawal.disagreement(agreement(fold), least=1)
         )
         self._accused: Mapping[str, str] = {}
         self._others: dict[frozenset[str], TickFold] = {}
         self.undecided = ""
-        self._restart(Conviction())
+        self._restart(withdrawal.Conviction())
 
-    def _restart(self, conviction: Conviction) -> None:
+    def _restart(self, conviction: withdrawal.Conviction) -> None:
         self._conviction = conviction
         self._retried = 0.0
         self.checkpoints = Checkpoints()
 
     # Inputs.
 
-    def add_start(self, start: InitialPoseFactor) -> None:
+    def add_start(self, start: joining.InitialPoseFactor) -> None:
         """Add a stream's initial pose, before its submaps."""
         self.inputs.add_start(start)
 
@@ -140,7 +118,7 @@ class TickFold:
         submap: Submap,
         digest: bytes,
         sightings: Sequence[SightingFactor] = (),
-        own: OwnBiases = NO_OWN,
+        own: contribution.OwnBiases = contribution.NO_OWN,
     ) -> None:
         """Add a submap with the inter-robot measurements from it; roll back to before its tick."""
         tick = self.inputs.add_submap(submap, digest, sightings, own)
@@ -170,7 +148,7 @@ class TickFold:
     def roll_back(self, tick: float) -> None:
         """Drop the ticks from this one on; all of them if a conviction is based on one."""
         if tick <= self._conviction.at:
-            self._restart(Conviction())
+            self._restart(withdrawal.Conviction())
         self.checkpoints.roll_back(tick)
         self._roll_back_others(tick)
 
@@ -181,7 +159,7 @@ class TickFold:
     # The fold of the closed ticks.
 
     @property
-    def fold(self) -> Fold:
+    def fold(self) -> joining.Fold:
         """The fold over all ticks so far."""
         return self.checkpoints.fold
 
@@ -235,7 +213,7 @@ class TickFold:
             return True
         return fold.size >= GROWTH * self.checkpoints.tested and self._convict(fold, tick)
 
-    def _fold_tick(self, fold: Fold, tick: int) -> Fold:
+    def _fold_tick(self, fold: joining.Fold, tick: int) -> joining.Fold:
         """Fold a tick, with condensed submaps restored if contradicted."""
         members = self.inputs.tick(tick, self._gone)
         size = fold.size
@@ -264,7 +242,7 @@ class TickFold:
         gone = self._gone.difference(self._conviction.suspended)
         return len(self.inputs.keys(-math.inf, tick, gone))
 
-    def _convict(self, fold: Fold, at: float) -> bool:
+    def _convict(self, fold: joining.Fold, at: float) -> bool:
         """Withdraw or suspend the robot that a trial finds; return whether there is one.
 
         at: the tick; infinity for the full solution, which suspends no robot.
@@ -286,31 +264,31 @@ class TickFold:
         if found.robot is None or not self.convicts:
             return False
         own = sum(n + 1 for stream, n in self.members(fold).items() if stream[0] == found.robot)
-        if math.isinf(at) or own >= LEAST_SUBMAPS:
+        if math.isinf(at) or own >= withdrawal.LEAST_SUBMAPS:
             self._restart(self._conviction.withdraw(found.robot, found.reason, at))
         else:
-            suspension = Suspension(found.reason, GROWTH * self._size_until(at))
+            suspension = withdrawal.Suspension(found.reason, GROWTH * self._size_until(at))
             self._restart(self._conviction.suspend(found.robot, suspension, at))
         return True
 
-    def _try_robots(self, fold: Fold, until_ns: float) -> Trial | None:
+    def _try_robots(self, fold: joining.Fold, until_ns: float) -> withdrawal.Trial | None:
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:
             return None
         if max(self.disagreement(fold).values(), default=0.0) <= limit:
             return None
-        if not find_suspects(self.agreement(fold), limit):
+        if not withdrawal.find_suspects(self.agreement(fold), limit):
             return None
 
         def without(robots: Collection[str]) -> Agreement | None:
             rest = self.leave_out(robots, until_ns).fold
             return self._agreement_at_rest(rest) if rest.home else None
 
-        return hold_trial(self._agreement_at_rest(fold), limit, without)
+        return withdrawal.hold_trial(self._agreement_at_rest(fold), limit, without)
 
-    def _agreement_at_rest(self, fold: Fold) -> Agreement:
+    def _agreement_at_rest(self, fold: joining.Fold) -> Agreement:
         """Agreement of a raw fold's full solution, or of a condensed fold."""
-        at_rest = fold if fold.condensed_count else solve_fold(fold, self.settings)
+        at_rest = fold if fold.condensed_count else joining.solve_fold(fold, self.settings)
         return marginals.joint_cost(at_rest)
 
     def leave_out(self, robots: Collection[str], until_ns: float) -> "TickFold":
@@ -332,13 +310,13 @@ class TickFold:
         cuts: tuple[Seam, ...] = (),
     ) -> "TickFold":
         other = TickFold(self._config, limits, self.inputs)
-        other.checkpoints = Checkpoints(replace(EMPTY_FOLD, cuts=cuts))
+        other.checkpoints = Checkpoints(replace(joining.EMPTY_FOLD, cuts=cuts))
         other.convicts = other._tries = False
         other._ordered = self._gone.union(robots)
         other.fold_until(until_ns)
         return other
 
-    def fold_apart(self, fold: Fold, *, ahead: bool) -> Mapping[str, Fold]:
+    def fold_apart(self, fold: joining.Fold, *, ahead: bool) -> Mapping[str, joining.Fold]:
         """Fold each robot's submaps by themselves where a robot's disagreement exceeds the limit,
         and as many times its disagreement alone; a fold in another frame than the team's is empty.
         """
@@ -351,7 +329,7 @@ class TickFold:
                 self._others.clear()
             return {}
         team = {robot for (robot, _), key in fold.home.items() if key == fold.main_key}
-        folds: dict[str, Fold] = {}
+        folds: dict[str, joining.Fold] = {}
         alone: dict[str, float] = {}
         for robot in sorted(team):
             own = self.leave_out(self.inputs.robots - {robot}, self._until_ns)
@@ -359,7 +337,7 @@ class TickFold:
             if apart.contributions:
                 alone.update(own.disagreement(apart))
             is_in_frame = apart.frame == fold.frame or apart.frame in fold.starts
-            folds[robot] = apart if is_in_frame else EMPTY_FOLD
+            folds[robot] = apart if is_in_frame else joining.EMPTY_FOLD
         contradict = any(
             value > limit * max(1.0, alone.get(robot, 1.0)) for robot, value in together.items()
         )
@@ -367,14 +345,14 @@ class TickFold:
 
     # Solutions beyond the closed ticks.
 
-    def fold_ahead(self) -> Fold:
+    def fold_ahead(self) -> joining.Fold:
         """Return the fold of all inputs, provisional ones included."""
         fold = self.fold
         for tick in self._open_ticks():
             fold = self._fold_tick(fold, tick)
         return fold
 
-    def accuse(self, provisional: Fold) -> Mapping[str, str]:
+    def accuse(self, provisional: joining.Fold) -> Mapping[str, str]:
         """Find the robot that contradicts the rest in a provisional fold, after each GROWTH."""
         if provisional is self.fold or not self.convicts:
             return {}
@@ -386,7 +364,7 @@ class TickFold:
             )
         return {robot: why for robot, why in self._accused.items() if robot not in self._gone}
 
-    def solve(self) -> Fold:
+    def solve(self) -> joining.Fold:
         """Solve for all inputs in full, without the robots that are then withdrawn."""
         while True:
             self.fold_until(math.inf)
@@ -397,11 +375,11 @@ class TickFold:
             fold = self._fold_raw()
             if not fold.contributions:
                 return fold
-            fold = solve_fold(fold, self.settings)
+            fold = joining.solve_fold(fold, self.settings)
             if not self._convict(fold, math.inf) and not self.suspended:
                 return self._cut_late(fold)
 
-    def _cut_late(self, fold: Fold) -> Fold:
+    def _cut_late(self, fold: joining.Fold) -> joining.Fold:
         """Fold again with the seams that only later submaps show (`late_seams`)."""
         for _ in range(LATE_CUTS):
             if not fold.has_unnamed or fold.condensed_count:
@@ -410,10 +388,10 @@ class TickFold:
             if seam is None:
                 break
             again = self._fold_others((), math.inf, None, (*fold.cuts, seam)).fold
-            fold = solve_fold(again, self.settings)
+            fold = joining.solve_fold(again, self.settings)
         return fold
 
-    def _fold_raw(self) -> Fold:
+    def _fold_raw(self) -> joining.Fold:
         fold = self.fold
         if self._limits is None or fold.size <= self._limits.begin:
             return fold
@@ -423,7 +401,7 @@ class TickFold:
                 return fold
         return self._fold_others((), math.inf, None).fold
 
-    def submaps_of_withdrawn(self) -> Mapping[str, Sequence[Contribution]]:
+    def submaps_of_withdrawn(self) -> Mapping[str, Sequence[contribution.Contribution]]:
         """Return the submaps of each robot left out."""
         return {
             robot: [
@@ -434,17 +412,17 @@ class TickFold:
 
     # The names of a fold.
 
-    def digest(self, fold: Fold, *more: bytes) -> bytes:
+    def digest(self, fold: joining.Fold, *more: bytes) -> bytes:
         """Digest the fold's set and `more`."""
         return self.inputs.digest(fold, more, self.checkpoints.tick, self._gone)
 
-    def members(self, fold: Fold) -> Mapping[Stream, int]:
+    def members(self, fold: joining.Fold) -> Mapping[contribution.Stream, int]:
         """Return the last sequence of each stream, folded or refused."""
-        last: dict[Stream, int] = {}
+        last: dict[contribution.Stream, int] = {}
         parts = [(stream, fold.next_sequence(stream) - 1) for stream in fold.home]
         parts += [(key[1:3], key[3]) for key in fold.refused]
         for part, sequence in parts:
-            stream = whole_of(part)
-            if not is_absolute(stream):
+            stream = contribution.whole_of(part)
+            if not contribution.is_absolute(stream):
                 last[stream] = max(last.get(stream, -1), sequence)
         return {stream: last[stream] for stream in sorted(last)}

@@ -5,35 +5,29 @@ from itertools import groupby
 
 import numpy as np
 
+from teamslam.team.estimation.association import member_log
 from teamslam.team.estimation.association.landmark_sets import Landmarks, Verdict
-from teamslam.team.estimation.association.member_log import (
-    KINDS,
-    LAST,
-    LocalLandmark,
-    MemberRecord,
-    record_of,
-)
 from teamslam.team.estimation.contribution import PART
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 
-STEPS = ("", *KINDS)
+STEPS = ("", *member_log.KINDS)
 """The step that merged an unnamed landmark into a set, by its number on the wire."""
 DECISIONS = 100
 """Most accepted decisions in a map, and most deferred ones."""
 LARGEST = 1e300
 """Bound of the figures of a merge on the wire, which are finite there."""
-SHOWN = 1 + LAST
+SHOWN = 1 + member_log.LAST
 """Most members of a landmark in a running map; all are in the final one."""
 
 
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:
     """Tabulate the unnamed landmarks; every: all members, else the first and last."""
-    members: Iterable[tuple[MemberRecord, int]]
+    members: Iterable[tuple[member_log.MemberRecord, int]]
     if every:
         identities = landmarks.identities()
         members = (
-            (record_of(stream, sequence, row), identities[row[1]])
+            (member_log.record_of(stream, sequence, row), identities[row[1]])
             for stream, sequence, rows in landmarks.log.all_rows()
             for row in rows.tolist()
         )
@@ -62,11 +56,11 @@ def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membersh
     return tuple(table)
 
 
-Entry = tuple[LocalLandmark, int, int, tuple[float, float, float]]
+Entry = tuple[member_log.LocalLandmark, int, int, tuple[float, float, float]]
 """A member, its identity, the index of its step in STEPS, and the figures of that step."""
 
 
-def _make_entry(member: MemberRecord, id_: int) -> Entry:
+def _make_entry(member: member_log.MemberRecord, id_: int) -> Entry:
     name, tie = member
     if tie is None:
         return name, id_, 0, (0.0, 0.0, 0.0)
@@ -85,7 +79,7 @@ def decisions_of(landmarks: Landmarks) -> tuple[m.AssociationDecision, ...]:
 def verdict_of(judgement: m.Judgement) -> Verdict:
     """Convert an operator's judgement to the fold's verdict."""
     first, second = (
-        LocalLandmark(each.robot, each.incarnation, each.sequence, each.local)
+        member_log.LocalLandmark(each.robot, each.incarnation, each.sequence, each.local)
         for each in sorted(
             (judgement.first, judgement.second),
             key=lambda x: (x.robot, x.incarnation, x.sequence, x.local),
