@@ -1,7 +1,7 @@
 """Figures of Ma & Ma's report: errors over 1400 frames (4, 6), paths and maps (3, 5)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -29,7 +29,7 @@ from teamslam.sim.studies.experiments.ma import (
 )
 from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
-from teamslam.sim.studies.experiments.xu import Method, Panel, drawing, numbers, row
+from teamslam.sim.studies.experiments.xu import Method, Panel, draw_curves, numbers, row
 from teamslam.team.shapes import Float
 
 if TYPE_CHECKING:
@@ -72,7 +72,8 @@ class _ErrorFigure(NamedTuple):
                     f"{options.seeds[0]} within its own 3σ bound. Without landmarks "
                     "the filters publish no pose, and the curve is flat."
                 )
-                draw = drawing(f"{self.title}: {dataset.name}", panel, found, "frame")
+                title = f"{self.title}: {dataset.name}"
+                draw = partial(draw_curves, title, panel, found, "frame")
                 pictures.append(Picture(dataset.name, caption, draw))
         columns = ("set, method", "printed mean [m]", "mean [m]", "run's max [m]", "max [m]",
                    "10 … 90 %", "RMS [m]", "end [m]", "NEES/dof")  # fmt: skip
@@ -209,7 +210,7 @@ class _PathFigure(NamedTuple):
                     "crosses: true landmarks; ellipses: 95 % of the covariances; light blue: "
                     "particles at eight times."
                 )
-                draw = _PathDrawing(f"{self.title}: {dataset.name}", tuple(runs))
+                draw = partial(_draw_runs, f"{self.title}: {dataset.name}", runs)
                 pictures.append(Picture(dataset.name, caption, draw))
         table = Table(
             f"{self.title}: mean distance of the path [m]", ("robot", "mean [m]"), tuple(rows)
@@ -236,19 +237,14 @@ def _mean_errors(run: Figures) -> dict[str, float]:
     }
 
 
-@dataclass(frozen=True)
-class _PathDrawing:
-    title: str
-    runs: tuple[tuple[Method, Figures], ...]
-
-    def __call__(self, path: Path) -> None:
-        picture = figure(6.5 * len(self.runs), 7.2)
-        row = picture.subplots(1, len(self.runs), squeeze=False)[0]
-        for axis, (method, run) in zip(row, self.runs, strict=True):
-            _draw_paths(axis, run)
-            axis.set_title(method.name, fontsize=11)
-        picture.suptitle(self.title)
-        picture.savefig(path, dpi=110)
+def _draw_runs(title: str, runs: list[tuple[Method, Figures]], path: Path) -> None:
+    picture = figure(6.5 * len(runs), 7.2)
+    row = picture.subplots(1, len(runs), squeeze=False)[0]
+    for axis, (method, run) in zip(row, runs, strict=True):
+        _draw_paths(axis, run)
+        axis.set_title(method.name, fontsize=11)
+    picture.suptitle(title)
+    picture.savefig(path, dpi=110)
 
 
 def _draw_paths(axis: "Axes", run: Figures) -> None:

@@ -5,7 +5,8 @@ The scenario `thesis` with the 50 particles of section 4.4.2: the median of many
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -107,7 +108,13 @@ class ErrorFigure(NamedTuple):
                 f"{self.title}{': ' if panel.name else ''}{panel.name}. Above: medians over "
                 f"{options.seed_count} with the 10 … 90 % band. Below: the run "
                 f"of seed {options.seeds[0]} within its own 3σ bound; dashed: the printed maximum.",
-                drawing(f"{self.title}{': ' if panel.name else ''}{panel.name}", panel, curves),
+                partial(
+                    draw_curves,
+                    f"{self.title}{': ' if panel.name else ''}{panel.name}",
+                    panel,
+                    curves,
+                    "step",
+                ),
             )
             for panel in self.panels
             if (curves := found[panel.name])
@@ -223,18 +230,10 @@ def numbers(panel: Panel, name: str, curves: Curves) -> Figures:
     }
 
 
-def drawing(
-    title: str, panel: Panel, found: Mapping[str, Curves], unit: str = "step"
-) -> Callable[[Path], None]:
+def draw_curves(
+    title: str, panel: Panel, found: Mapping[str, Curves], unit: str, path: Path
+) -> None:
     """Draw medians with bands, and one run with its bound."""
-
-    def draw(path: Path) -> None:
-        _draw(path, title, panel, found, unit)
-
-    return draw
-
-
-def _draw(path: Path, title: str, panel: Panel, found: Mapping[str, Curves], unit: str) -> None:
     methods = [method for method in panel.methods if method.name in found]
     picture = figure(11.0, 8.0)
     grid = picture.add_gridspec(2, len(methods), height_ratios=(1.3, 1.0))
