@@ -24,8 +24,7 @@ ROBOT_COLOURS = (
 """Robot colours in order of name, for dark and light ground."""
 ELLIPSE_SCALE = float(np.sqrt(5.991))
 """Mahalanobis distance that contains 95 % of a planar Gaussian."""
-BENT_RAD = 0.09
-"""Heading difference [rad] above which a path segment is drawn as a curve."""
+BENT_RAD = 0.09  # heading difference [rad] above which a path segment is drawn as a curve
 
 
 def colour_of(number: int) -> str:

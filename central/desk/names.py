@@ -14,8 +14,7 @@ _FIRST_LIFE = " (incarnation 1)"
 _ROBOT = re.compile(r"(\S+) \(incarnation \d+\)")
 
 
-PACKED = (".zip", ".mcap", ".db3")
-"""Suffixes of data sets in one file."""
+PACKED = (".zip", ".mcap", ".db3")  # suffixes of data sets in one file
 
 
 def data_set_name(path: str | PurePath) -> str:

@@ -17,8 +17,7 @@ from teamslam.team.wire.codec import encoded
 if TYPE_CHECKING:
     from teamslam.team.keys.signing import Signer
 
-CENTRE_S = 10.0
-"""Time [s] within which a running centre or robot is detected."""
+CENTRE_S = 10.0  # time [s] within which a running centre or robot is detected
 LOOK_S = 0.05
 PEERS = (ch.TEAM_CONFIG, ch.TEAM_MAP, ch.TEAM_FINAL)
 _LANDMARK = re.compile(rf"({ROBOT.pattern})/(\d+)/(\d+)/(\d+)")

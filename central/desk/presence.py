@@ -11,12 +11,9 @@ from teamslam.team.wire.bus import Bus, open_valid
 from teamslam.team.wire.message_order import later_head
 
 LOOK_S = 0.1
-APART_S = 1.0
-"""Reported clock difference [s]; longer than any transmission delay."""
-PAST_S = 3600.0
-"""Stamps further than this [s] from the machine's clock are recorded data."""
-DRIFT = 0.1
-"""Relative drift of an offset that is a lag, not a clock."""
+APART_S = 1.0  # reported clock difference [s]; longer than any transmission delay
+PAST_S = 3600.0  # stamps further than this [s] from the machine's clock are recorded data
+DRIFT = 0.1  # relative drift of an offset that is a lag, not a clock
 
 
 @dataclass

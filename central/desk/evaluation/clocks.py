@@ -23,28 +23,21 @@ from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 
-APART_NS = 2_000_000_000
-"""Greatest time between two compared measurements of a landmark."""
+APART_NS = 2_000_000_000  # greatest time between two compared measurements of a landmark
 STRETCH_NS = 5_000_000_000
 LEAST_STRETCHES = 12
 """Least effective number of stretches, 1/Σ share² of the information on τ."""
-STEP_NS = 250_000_000
-"""Step of the central derivative by τ; averages interval noise."""
+STEP_NS = 250_000_000  # step of the central derivative by τ; averages interval noise
 HUBER = 2.0
 ROUNDS = 20
 SETTLED_NS = 1_000_000
-LEAST_SLOPE = 0.2
-"""Least share of the derivative that is motion, not odometry noise."""
-LARGEST_NS = 2_000_000_000
-"""Largest plausible clock offset."""
-NEAR_M = 1.0
-"""Point errors grow with distance beyond this [m]."""
-BEYOND_DOUBT = 5.0
-"""Offset, in standard deviations, from which it is reported."""
+LEAST_SLOPE = 0.2  # least share of the derivative that is motion, not odometry noise
+LARGEST_NS = 2_000_000_000  # largest plausible clock offset
+NEAR_M = 1.0  # point errors grow with distance beyond this [m]
+BEYOND_DOUBT = 5.0  # offset, in standard deviations, from which it is reported
 CONTRADICTION = 4.0
 """Standard deviations from which two estimates of an offset exclude each other."""
-LEAST_S = 0.02
-"""Smallest reported offset [s]."""
+LEAST_S = 0.02  # smallest reported offset [s]
 UNIX_S = 1e9
 
 
@@ -353,8 +346,7 @@ def _first_of_fit(
     return float(p[0] / norms[0]), math.sqrt(float(sums @ sums)) / float(norms[0])
 
 
-MIRRORED = 0.9
-"""Least share of the deciding stretches that fit reflected: 11 of 12."""
+MIRRORED = 0.9  # least share of the deciding stretches that fit reflected: 11 of 12
 
 
 def mirrored_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis | None:

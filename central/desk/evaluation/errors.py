@@ -11,8 +11,7 @@ from teamslam.team.estimation.map_joining.alignment import NEEDED, procrustes
 from teamslam.team.estimation.se2 import between
 from teamslam.team.shapes import Bool, Float, Int64
 
-TRUTH_GAP_NS = 1_000_000_000
-"""Largest gap between truth samples that is interpolated."""
+TRUTH_GAP_NS = 1_000_000_000  # largest gap between truth samples that is interpolated
 BAND = 0.95
 
 
@@ -33,8 +32,7 @@ def join_batches(batches: Sequence[Path]) -> Path:
     return Path(stamps, np.concatenate([batch.poses for batch in batches])[first])
 
 
-SMALL_TURN = 1e-6
-"""Below this [rad], (δ/2) cot(δ/2) is 1 to the last bit."""
+SMALL_TURN = 1e-6  # below this [rad], (δ/2) cot(δ/2) is 1 to the last bit
 
 
 @dataclass(frozen=True)

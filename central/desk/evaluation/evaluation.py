@@ -255,12 +255,10 @@ def _motion(robots: Iterable[RobotResult]) -> Float[np.ndarray, "3"] | None:
 
 
 LEAST = 10
-GAP_NS = 1_500_000_000
-"""Largest gap between fixes that is interpolated."""
+GAP_NS = 1_500_000_000  # largest gap between fixes that is interpolated
 SHIFTS_S = np.arange(-1.0, 1.01, 0.25)
 ROUNDS = 20
-NEAREST_M = 0.1
-"""Least distance [m] in the weights 1/d."""
+NEAREST_M = 0.1  # least distance [m] in the weights 1/d
 
 Fixes = tuple[Int64[np.ndarray, " G"], Float[np.ndarray, "G 2"]]
 

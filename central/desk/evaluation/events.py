@@ -13,8 +13,7 @@ Kind = Literal[
     "joined", "restarted", "lost", "left", "map", "closure", "undone", "withdrawn", "refused",
     "warning", "done",
 ]  # fmt: skip
-MOST = 2000
-"""Most events of a run."""
+MOST = 2000  # most events of a run
 FIRST = 1
 _AWAITED = ("waiting for ", "has not appeared yet", "no measurements of this team yet")
 """Start-up states of a node, which are no events."""

@@ -19,10 +19,8 @@ from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 
-REJECTED = "rejected: "
-"""Prefix of a rejected measurement's disposition."""
-USUAL = ("hybrid", "join")
-"""Default estimator and rule."""
+REJECTED = "rejected: "  # prefix of a rejected measurement's disposition
+USUAL = ("hybrid", "join")  # default estimator and rule
 
 
 def figure(of: object, path: str) -> Any:

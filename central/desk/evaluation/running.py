@@ -27,12 +27,9 @@ from teamslam.team.wire.arrays import floats
 
 KNOWN_FRAMES = {"", START_POSES, SURVEY_FRAME}
 """Frames with truth that no stream's start fixes."""
-SPACING_NS = 100_000_000
-"""Least spacing of compared estimates."""
-WAITING = 4_096
-"""Most poses per robot that await truth."""
-BATCHES = 20_000
-"""Most truth batches kept per robot."""
+SPACING_NS = 100_000_000  # least spacing of compared estimates
+WAITING = 4_096  # most poses per robot that await truth
+BATCHES = 20_000  # most truth batches kept per robot
 
 
 @dataclass

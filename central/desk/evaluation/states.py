@@ -16,8 +16,7 @@ State = Literal["joined", "not joined", "withdrawn", "lost", "alone"]
 contradiction. lost: its stream is incomplete. alone: the rule does not fuse.
 """
 UNNAMED_REASON = "the log does not contain the reason"
-SAVED_MAP = "the saved map "
-"""Before the name of a saved map in a map's reasons."""
+SAVED_MAP = "the saved map "  # before the name of a saved map in a map's reasons
 NO_MEMBER = "nothing of it is in the map"
 
 

@@ -25,12 +25,9 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import try_open
 
-TEAM_SPACE = "/teamslam"
-"""Namespace of the team's map and diagnostics."""
-TRUTH_FRAME = "world"
-"""Frame of the true poses, the parent of `map`."""
-ODOMETRY_HZ = 50.0
-"""Highest rate of the exported odometry [Hz]."""
+TEAM_SPACE = "/teamslam"  # namespace of the team's map and diagnostics
+TRUTH_FRAME = "world"  # frame of the true poses, the parent of `map`
+ODOMETRY_HZ = 50.0  # highest rate of the exported odometry [Hz]
 
 
 class _Robot:

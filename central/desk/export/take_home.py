@@ -32,8 +32,7 @@ from teamslam.team.wire.arrays import ids
 MAP_COLUMNS = (
     "id", "x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "measurements", "frame",
 )  # fmt: skip
-DEGREES = ("latitude_deg", "longitude_deg")
-"""Further columns of a map with a datum."""
+DEGREES = ("latitude_deg", "longitude_deg")  # further columns of a map with a datum
 STATE = "state"
 """Further column of a map that was compared with saved ones: moved, gone, new, unchanged."""
 CLASSES = ("class", "class_probability")

@@ -47,10 +47,8 @@ CHANGE_MARKS = {
 }
 """Colour, marker, its size [pt²] and line of landmarks that differ from the saved maps."""
 MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
-SAME_M = 1e-9
-"""Distance of equal points [m]."""
-LEAST_SHARE = 0.01
-"""Least share of the map's extent of a drawn ellipse's median semi-axis."""
+SAME_M = 1e-9  # distance of equal points [m]
+LEAST_SHARE = 0.01  # least share of the map's extent of a drawn ellipse's median semi-axis
 
 
 def map_picture(
@@ -388,10 +386,8 @@ def _title(evaluation: Evaluation) -> list[str]:
 BINS = 40
 BAND = 0.95
 BAND_COLOUR = "#d9ead3"
-WARN, FAIL = 1.1, 1.3
-"""Levels of the centre's consistency monitor."""
-LOGARITHMIC_FROM = 12.0
-"""NEES from which the axis is logarithmic."""
+WARN, FAIL = 1.1, 1.3  # levels of the centre's consistency monitor
+LOGARITHMIC_FROM = 12.0  # NEES from which the axis is logarithmic
 
 
 def _sum_in_bins(

@@ -14,10 +14,8 @@ if TYPE_CHECKING:
 
 DPI = 120
 PAPER_DPI = 300
-COLUMN_IN, TEXT_IN = 3.5, 7.16
-"""Column and text width of a two-column page [inches]."""
-PAPER_PT, POINT_PT = 8.0, 6.0
-"""Text size on paper, and size of point labels [points]."""
+COLUMN_IN, TEXT_IN = 3.5, 7.16  # column and text width of a two-column page [inches]
+PAPER_PT, POINT_PT = 8.0, 6.0  # text size on paper, and size of point labels [points]
 LEAST_IN, MOST_IN = 1.0, 40.0
 INCHES = {"in": 1.0, "mm": 1.0 / 25.4, "cm": 1.0 / 2.54, "pt": 1.0 / 72.27}
 
@@ -81,8 +79,7 @@ class Style:
 
 
 SCREEN = Style()
-PAGE = Style(vectors=True)
-"""Screen pictures, with SVG for the page."""
+PAGE = Style(vectors=True)  # screen pictures, with SVG for the page
 _current: ContextVar[Style] = ContextVar("style", default=SCREEN)
 
 

@@ -23,8 +23,7 @@ from teamslam.central.desk.report import tables
 from teamslam.central.desk.report.run import Run
 from teamslam.team.recording.provenance import version
 
-LISTED_EVENTS = 200
-"""Most events in the page's table; report.json has all."""
+LISTED_EVENTS = 200  # most events in the page's table; report.json has all
 _ORIGIN = ("git.commit", "seed", "version.teamslam", "version.python")
 
 

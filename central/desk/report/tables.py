@@ -23,8 +23,7 @@ from teamslam.team.config import MAP
 from teamslam.team.estimation.contribution import named
 from teamslam.team.wire import messages as m
 
-ABSURD_NEES = 1000
-"""NEES per degree of freedom above which words replace it."""
+ABSURD_NEES = 1000  # NEES per degree of freedom above which words replace it
 ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 DEGREES = degrees(1.0)
 LEFT = ("robot", "disposition", "channel", "kind", "landmarks", "reason")
@@ -33,8 +32,7 @@ CHANGES = ("moved", "gone", "new", "unchanged")
 """States of landmarks against saved maps, as listed."""
 LISTED = 5
 """Most landmarks of one state in a line of text, and most robots named below a table."""
-DECISIONS = 200
-"""Most decisions in the table; report.json has all."""
+DECISIONS = 200  # most decisions in the table; report.json has all
 Rows = Sequence[tuple[str, str]]
 
 

@@ -10,8 +10,7 @@ from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 
-PATH_POINTS = 1_000
-"""Most points of a path; a longer one is halved."""
+PATH_POINTS = 1_000  # most points of a path; a longer one is halved
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, try_open
 from teamslam.team.wire.messages import FusedMap, Status
 
-VIEWED = frozenset((*ViewerNode.listens, ch.ALIVE))
-"""Channels of a viewer."""
+VIEWED = frozenset((*ViewerNode.listens, ch.ALIVE))  # channels of a viewer
 
 
 class Viewing:

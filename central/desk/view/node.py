@@ -29,20 +29,13 @@ from teamslam.team.wire import views
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.channels import Channel
 
-PERIOD_NS = 1_000_000_000
-"""Team time between views of poses and errors."""
-PATHS_EVERY = 10
-"""Number of views per whole path."""
-TRAIL_NS = 15_000_000_000
-"""Length of the recent path sent with a robot."""
-LAG_NS = 30_000_000_000
-"""A robot further behind the fastest does not hold back the view."""
-MOST_PERIODS = 60
-"""Most views per message."""
-FORGET_NS = 10_000_000_000
-"""Time for which an estimate waits for its truth."""
-_MARKS_ACROSS = 45.0
-"""Drawn robots that fit across the known extent."""
+PERIOD_NS = 1_000_000_000  # team time between views of poses and errors
+PATHS_EVERY = 10  # number of views per whole path
+TRAIL_NS = 15_000_000_000  # length of the recent path sent with a robot
+LAG_NS = 30_000_000_000  # a robot further behind the fastest does not hold back the view
+MOST_PERIODS = 60  # most views per message
+FORGET_NS = 10_000_000_000  # time for which an estimate waits for its truth
+_MARKS_ACROSS = 45.0  # drawn robots that fit across the known extent
 Motion = Float[np.ndarray, "3"] | None
 
 

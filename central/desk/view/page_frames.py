@@ -40,12 +40,9 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
 from teamslam.team.wire.bus import Sample
 
-SPACING_NS = 100_000_000
-"""Least time between poses sent to the page."""
-MAP_SPACING_NS = 1_000_000_000
-"""Least time between maps sent to the page."""
-SEEN_NS = 500_000_000
-"""Least time between measurements of one landmark sent to the page."""
+SPACING_NS = 100_000_000  # least time between poses sent to the page
+MAP_SPACING_NS = 1_000_000_000  # least time between maps sent to the page
+SEEN_NS = 500_000_000  # least time between measurements of one landmark sent to the page
 CHANNELS = frozenset(
     (*ViewerNode.listens, ch.ALIVE, ch.ROBOT_CONFIG, ch.OBSERVATIONS, ch.SIGHTINGS)
 )

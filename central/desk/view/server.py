@@ -41,8 +41,7 @@ VIEWERS = (*LOOPBACK, "https://app.foxglove.dev", "file://")
 """Origins of viewers: this machine's hosts and Foxglove."""
 PROTOCOLS = tuple(map(Subprotocol, ("foxglove.sdk.v1", "foxglove.websocket.v1")))
 STREAM = "/stream"
-LOOK_S = 0.2
-"""Polling period [s] of a growing log."""
+LOOK_S = 0.2  # polling period [s] of a growing log
 _BATCH_BYTES = 500_000
 _TYPES = {
     ".html": "text/html",
