@@ -7,7 +7,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -143,18 +143,12 @@ def _resize(figure: "Figure", width_in: float | None) -> None:
         if is_column and panels and axis.get_title():
             axis.set_title("")
         legend = axis.get_legend() if panels else next(iter(figure.legends), None)
-        if legend is None or not (is_column or not panels):
-            continue
-        handles, labels = axis.get_legend_handles_labels()
-        legend.remove()
-        columns = 2 if is_column else 4
-        if panels:
-            axis.legend(
-                handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.3), ncols=columns,
-                frameon=False, fontsize=POINT_PT,
-            )  # fmt: skip
-        else:
-            figure.legend(
-                handles, labels, loc="outside lower center", ncols=columns, frameon=False,
-                fontsize=PAPER_PT,
-            )  # fmt: skip
+        if legend is not None and (is_column or not panels):
+            found = axis.get_legend_handles_labels()
+            legend.remove()
+            below: dict[str, Any] = {"loc": "outside lower center", "fontsize": PAPER_PT}
+            if panels:
+                at = (0.5, -0.3)
+                below = {"loc": "upper center", "bbox_to_anchor": at, "fontsize": POINT_PT}
+            owner = axis if panels else figure
+            owner.legend(*found, ncols=2 if is_column else 4, frameon=False, **below)

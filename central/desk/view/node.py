@@ -77,6 +77,9 @@ class _Robot:
         assert self.estimate is not None
         return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
+    def reach(self, stamp_ns: int) -> None:
+        self.reached_ns = stamp_ns if self.reached_ns is None else max(self.reached_ns, stamp_ns)
+
     def leave(self) -> None:
         self.coming.clear()
         self.estimate = self.last_error = None
@@ -203,8 +206,7 @@ class ViewerNode:
                 robot.coming.append(message)
             elif robot.estimate is not None or robot.coming:
                 robot.leave()
-            before = robot.reached_ns
-            robot.reached_ns = message.stamp_ns if before is None else max(before, message.stamp_ns)
+            robot.reach(message.stamp_ns)
 
     def _take_status(self, message: m.Status) -> None:
         if message.node == "central":
@@ -213,7 +215,7 @@ class ViewerNode:
             robot = self._of(message.node.removeprefix("robot/"))
             robot.status = message.figures
             if robot.reached_ns is not None:  # a robot without detections publishes only this
-                robot.reached_ns = max(robot.reached_ns, message.stamp_ns)
+                robot.reach(message.stamp_ns)
 
     def _extend(self, points: Float[np.ndarray, "n 2"]) -> None:
         self._low = np.minimum(self._low, points.min(axis=0, initial=math.inf))
