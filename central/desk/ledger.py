@@ -1,7 +1,6 @@
 """Ledger of a log: the disposition of every measurement (law 1), and the maps of every submap.
 
-The robot's node recomputes rejections. Measurements after the last submap are open if consumed,
-else lost.
+Measurements after the last submap are open if consumed, else lost.
 """
 
 from collections import Counter

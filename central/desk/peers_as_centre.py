@@ -1,7 +1,7 @@
-"""Present peers' map messages as a centre's, for a team without a centre.
+"""Present peers' map messages as a centre's, unless there is a centre.
 
 Running maps come from the first peer that publishes one, the final map is the one on which all
-peers agree. A present centre takes precedence.
+peers agree.
 """
 
 import hashlib
@@ -24,7 +24,8 @@ OF_AGREEMENT = (ch.TEAM_CONFIG, ch.TEAM_FINAL, ch.CONCLUDED, ch.GIVEN_UP, ch.ORD
 class Agreement:
     """Announced final map of each peer.
 
-    robots: the peers; None: all that announced a fold. Robots given up or withdrawn need not agree.
+    robots: the peers; None: all that announced a fold. A robot given up or withdrawn need not
+    agree.
     """
 
     def __init__(self, robots: Collection[str] | None = None) -> None:

@@ -61,10 +61,10 @@ class Pairs:
 class AssociationResult:
     """Association scores: over all detections, inside windows, and of the map.
 
-    label_of: of each unnamed landmark, or UNKNOWN. duplicates: landmarks beyond the first of a
-    label; confirmed: with at least two submaps; shown: in the final map. merges_right: pairs of
-    robots that share landmarks, half of which agree by label. merges_refused: pending attempts.
-    left_out: labelled detections in no submap. clutter_in_map: unlabelled ones in a submap.
+    duplicates: landmarks beyond the first of a label; confirmed: with two submaps; shown: in the
+    final map. merges_right: pairs of robots that share landmarks, half of which agree by label.
+    merges_refused: pending attempts. left_out: labelled detections in no submap. clutter_in_map:
+    unlabelled ones in a submap.
     """
 
     pairs: Pairs

@@ -1,9 +1,9 @@
 """Estimate the time offset of a robot's detections against its odometry, without truth.
 
-A landmark measured at t_i and t_j is at points b_i, b_j in the base frame. With the odometry motion
-D(τ) from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise. Sensor mount, range offset, odometry
-scales and drift are estimated jointly. The variance is the sandwich over stretches of time (Liang
-and Zeger 1986).
+A landmark measured at t_i and t_j is at b_i, b_j in the base frame. With the odometry motion D(τ)
+from t_i − τ to t_j − τ, b_j = D(τ)⁻¹ b_i up to noise. Sensor mount, range offset, odometry scales
+and drift are estimated jointly. The variance is the sandwich over stretches of time (Liang and
+Zeger 1986).
 """
 
 import math

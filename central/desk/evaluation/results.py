@@ -79,8 +79,8 @@ class Consumption:
 class PeerResult:
     """Announced conclusion of one peer.
 
-    complete_at_s: wall time from log start to its final map. have: submaps by robot. over: new
-    members by relaying node. agrees_with: number of peers with the same set.
+    complete_at_s: wall time from log start. have: submaps by robot. over: new members by relaying
+    node. agrees_with: number of peers with the same set.
     """
 
     final_map_sha256: str | None
@@ -97,9 +97,8 @@ class PeerResult:
 class MapResult:
     """Final map: L landmarks by id and their covariance (blocks unless `joint`).
 
-    truth: true positions, zero unless `known`. covariance_scale: factor to apply to submap
-    covariances. matching: of unnamed landmarks. changes: against saved maps. diagnosis: causes of
-    misfit, best first.
+    truth: true positions, zero unless `known`. covariance_scale: factor for submap covariances.
+    changes: against saved maps. diagnosis: causes of misfit, best first.
     """
 
     rule: str
@@ -127,10 +126,9 @@ class MapResult:
 class RobotResult:
     """One robot: dispositions of its measurements, and its poses against the truth.
 
-    smoothed: at submap ends, from the final map. online: published during the run. aligned: after
-    the rigid motion that aligns the map (`alignment`: "map"), or all smoothed paths ("paths"), or
-    the robot's own path ("trajectory"). own_map: unaligned. outside: running poses are not in the
-    team's frame.
+    smoothed: at submap ends, from the final map. aligned: after the rigid motion that aligns the
+    map (`alignment`: "map"), or all smoothed paths ("paths"), or its own path ("trajectory").
+    own_map: unaligned. outside: running poses are not in the team's frame.
     """
 
     consumption: Consumption
@@ -167,8 +165,7 @@ class Evaluation:
 
     notes: remarks of the world, and messages set aside (number: faults). arbitrary_frame: only
     aligned errors are meaningful. mirrored, lateness: by the measurements alone. recorded_ns: wall
-    time of the first message. truth_from_map: aligns the landmarks with the true ones, or the
-    paths.
+    time of the first message.
     """
 
     scenario: TeamConfig | None

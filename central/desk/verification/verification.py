@@ -1,9 +1,8 @@
 """Recompute every recomputable message of a log and compare.
 
 Each message is computed from the inputs that it names, so an error appears in one message only:
-submaps, own maps and own poses from measurements and configuration; a team pose from its prior;
-maps, priors and trajectories from the submaps of the map's version vector; exchanges of a feedback
-rule from the round's recorded maps.
+submaps, own maps and poses from measurements; a team pose from its prior; maps, priors and
+trajectories from the submaps of the map's version vector; exchanges from the recorded maps.
 """
 
 import math

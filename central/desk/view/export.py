@@ -102,8 +102,7 @@ NODE = "viewer"
 def run_viewer(bus: Bus, stop: threading.Event, peers: Collection[str] = ()) -> int:
     """Publish views until the final map is shown or `stop` is set; return their number.
 
-    peers: robots whose agreed map is the final one. Raises FaultyRunError at the end if the map
-    lacks a robot or a message could not be drawn.
+    peers: robots whose agreed map is the final one. Raises FaultyRunError at the end.
     """
     viewing = Viewing(peers)
     for channel in (*viewing.node.listens, *LISTENS):

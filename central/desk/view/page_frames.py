@@ -1,16 +1,15 @@
 """Frames for the page: one JSON object per event, in log order.
 
 t: seconds of team time since the first measurement. Poses and errors are rows of numbers, maps and
-particles base64 of little-endian float32 and uint32. Frames, by `k`: hello: first; live: growing.
-now: team time of all active robots. pose: rows x, y, heading, xx, xy, yy, heading variance.
-outside: whether the robot is outside the team's map; its poses are then not sent. frame: the
-robot's pose frame changes. err: rows of three errors, three 3σ bounds, NEES per dof. truth: rows x,
-y, heading. map: `changes` since the saved maps: number of unchanged landmarks, then landmark,
-state, place in the saved map, displacement, its sigma [m], χ², expected observations. path: `ends`:
-of submaps alone. align: x, y, theta of the truth's frame in another map frame, null while
-undetermined. see: rows of a measurement: landmark, −1 without identity, or teammate; ahead [m],
-left [m]. link: a submap (to) or a prior (from) `central`. fig: a node's figures. wait: start-up
-states of a node. bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of the log.
+particles base64 of little-endian float32 and uint32. Frames, by `k`: now: team time of all active
+robots. pose: rows x, y, heading, xx, xy, yy, heading variance. outside: whether the robot is
+outside the team's map; its poses are then not sent. frame: the pose frame changes. err: rows of
+three errors, three 3σ bounds, NEES per dof. truth: rows x, y, heading. map: `changes` since the
+saved maps: number of unchanged landmarks, then landmark, state, place in the saved map,
+displacement, its sigma [m], χ², expected observations. path: `ends`: of submaps alone. align: x, y,
+theta of the truth's frame in another map frame, or null. see: rows of landmark (−1 without
+identity) or teammate, ahead [m], left [m]. link: a submap (to) or a prior (from) `central`. wait:
+start-up states. bytes: [key, t, messages, bytes] of one second. ev: event. eof: end of the log.
 """
 
 import base64

@@ -1,8 +1,7 @@
 """Serve a log: page with a WebSocket stream of frames, and Foxglove's WebSocket.
 
-A new connection receives every frame of the log, then new ones. Pages of another origin or host
-name (DNS rebinding) are refused. Foxglove's SDK accepts any origin, so its server listens at a
-random loopback address and port behind a proxy, which checks Host and Origin.
+Pages of another origin or host name (DNS rebinding) are refused. Foxglove's SDK accepts any origin,
+so its server listens at a random loopback address and port behind a proxy.
 """
 
 import asyncio
