@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,15 +14,12 @@ from teamslam.central.desk.drawing import (
     draw_ellipses,
     robot_colours,
 )
-from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult, figure
+from teamslam.central.desk.evaluation.results import Evaluation, RobotResult, figure
 from teamslam.central.desk.names import OUTSIDE, in_order
 from teamslam.central.desk.pictures.run import in_the_maps_frame, new_figure, set_up_map
 from teamslam.central.desk.pictures.style import save
 from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable
 from teamslam.team import translate
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Row = tuple[str, tuple[str, ...]]
 MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
@@ -159,17 +156,12 @@ def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
     if len(truth):
         axis.plot(*truth.T, "x", color=TRUTH_COLOUR, markersize=8, label="true landmarks")
     for (name, run), (colour, marker) in zip(runs.items(), MAP_STYLES, strict=True):
-        if run.map is not None:
-            _draw_map(axis, run.map, colour, name, marker)
+        if (fused := run.map) is not None:
+            x, y = fused.means.T
+            axis.plot(x, y, marker, color=colour, markersize=8, markerfacecolor="none", label=name)
+            draw_ellipses(axis, fused.means, translate.blocks_of(fused.covariance), colour)
     set_up_map(axis)
     axis.set_title("Final maps with 95 % ellipses", fontsize=12)
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, frameon=False)
     save(figure, path)
     return True
-
-
-def _draw_map(axis: "Axes", fused: MapResult, colour: str, label: str, marker: str) -> None:
-    axis.plot(
-        *fused.means.T, marker, color=colour, markersize=8, markerfacecolor="none", label=label
-    )
-    draw_ellipses(axis, fused.means, translate.blocks_of(fused.covariance), colour)
