@@ -131,11 +131,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class ChannelResult:
-    """Counts of one channel's messages: all, bit-equal, equal within tolerance, lacking an
-    input.
-
-    first: first that differs, or else that lacks an input.
-    """
+    """Counts of one channel's messages; first: that differs, or else that lacks an input."""
 
     channel: str
     messages: int
