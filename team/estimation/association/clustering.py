@@ -9,6 +9,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import AssociationSettings
+from teamslam.team.estimation import dense
 from teamslam.team.estimation.association.certainty import association_probabilities
 from teamslam.team.estimation.association.gating import compute_mahalanobis, match_scan
 from teamslam.team.estimation.association.scans import (
@@ -16,7 +17,7 @@ from teamslam.team.estimation.association.scans import (
     Scans,
     initialise_landmark,
     predict_landmarks,
-    relative_to,
+    rotation,
 )
 from teamslam.team.estimation.association.smoothing import SmoothedWindow, smooth_window
 from teamslam.team.estimation.association.tracking import Slip, slip_covariance, track_window
@@ -221,7 +222,7 @@ def _mark_looks(scans: Scans, window: SmoothedWindow) -> Bool[np.ndarray, "L K"]
         own = slice(bounds[k], bounds[k + 1])
         if own.start == own.stop:
             continue
-        x, y = relative_to(np.broadcast_to(pose, (len(looks), 3)), window.landmarks).T
+        x, y = dense.product(window.landmarks - pose[:2], rotation(pose[2])).T
         bearing = core.atan2(y, x)
         looks[:, k] = (bearings[own].min() <= bearing) & (bearing <= bearings[own].max())
         looks[:, k] &= core.hypot(x, y) <= ranges[own].max()

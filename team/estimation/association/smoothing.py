@@ -1,6 +1,6 @@
 """Smoothing: estimate a window's path and landmarks by Gauss-Newton for a given association."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from teamslam.team.estimation.association.scans import (
     rotations,
 )
 from teamslam.team.estimation.se2 import wrapped
-from teamslam.team.shapes import Float, Int64
+from teamslam.team.shapes import Bool, Float, Int64
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²], which may be of rank 2 or zero."""
@@ -46,8 +46,50 @@ def smooth_window(
     """Minimise Σ ‖Log(motion⁻¹ ∘ before⁻¹ ∘ pose)‖² + Σ ‖point − Rᵀ(landmark − t)‖².
 
     The window starts at zero. landmark_of: by detection, or UNASSIGNED; every landmark has a
-    detection. Raises LinAlgError without a solution.
+    detection, and one with a single one is at it. Raises LinAlgError without a solution.
     """
+    counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(landmarks))
+    again = counts > 1
+    number = np.append(np.where(again, np.cumsum(again) - 1, UNASSIGNED), UNASSIGNED)
+    found = _solve_window(scans, number[landmark_of], poses, landmarks[again])
+    return found if again.all() else _add_single(found, scans, landmark_of, again)
+
+
+def _add_single(
+    found: SmoothedWindow,
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    again: Bool[np.ndarray, " L"],
+) -> SmoothedWindow:
+    """Add the landmarks of a single detection, of covariance A P Aᵀ + R by the others' P."""
+    rows = np.flatnonzero(~np.append(again, True)[landmark_of])
+    rows = rows[np.argsort(landmark_of[rows])]
+    of, m, n = scans.keyframes[rows], len(rows), len(found.covariance)
+    turn = rotations(found.poses[of, 2])
+    columns, at = 3 * of[:, None] + np.arange(3), np.arange(m)
+    A = np.zeros((2 * m, n))
+    by_pose = -dense.product(turn, pose_jacobians(scans.points[rows]))
+    A.reshape(m, 2, n)[at[:, None], :, columns] = by_pose.transpose(0, 2, 1)
+    AP = dense.product(A, found.covariance)
+    own = dense.product(AP, A.T)
+    R = dense.product(dense.product(turn, scans.covariances[rows]), turn.transpose(0, 2, 1))
+    own.reshape(m, 2, m, 2)[at, :, at] += R
+    landmarks = np.empty((len(again), 2))
+    landmarks[again] = found.landmarks
+    landmarks[~again] = found.poses[of, :2] + np.einsum("nij,nj->ni", turn, scans.points[rows])
+    order = np.argsort(np.concatenate((np.flatnonzero(again), np.flatnonzero(~again))))
+    k = 3 * len(found.poses)
+    all_columns = np.append(np.arange(k), (k + 2 * order[:, None] + np.arange(2)).ravel())
+    P = np.block([[found.covariance, AP.T], [AP, own]])[np.ix_(all_columns, all_columns)]
+    return replace(found, landmarks=landmarks, covariance=P)
+
+
+def _solve_window(
+    scans: Scans,
+    landmark_of: Int64[np.ndarray, " N"],
+    poses: Float[np.ndarray, "K 3"],
+    landmarks: Float[np.ndarray, "L 2"],
+) -> SmoothedWindow:
     used = np.nonzero(landmark_of != UNASSIGNED)[0]
     seen_by, seen = scans.keyframes[used], landmark_of[used]
     weights = dense.inverse(scans.covariances[used])

@@ -117,7 +117,7 @@ class Tracker:
         gain = dense.solve(S, HP).T
         step = dense.product(gain, (points - seen).ravel())
         P -= dense.product(gain, HP)
-        self._P[:n, :n] = 0.5 * (P + P.T)
+        np.multiply(P + P.T, 0.5, out=P)
         self.pose = compose(self.pose, step[:3])
         self._points[: len(self.names)] += step[3:].reshape(-1, 2)
 
