@@ -61,7 +61,6 @@ class RunningEstimator:
             start = InitialPose(*start_of_sensor(initial.pose, initial.covariance, self._mount))
         self._state: Any = self._filter.initial_state(config, start, known, self._generator)
         self.sequence = 0
-        self.unsolved = 0
         self.last_keyframe_ns: int | None = None
 
     @property
@@ -159,7 +158,6 @@ class RunningEstimator:
         step = RobotStep(self._config.id, increment, self._config.sensor, *seen)
         after = self._after(step)
         if after is None:  # no solution with the measurements: the motion alone
-            self.unsolved += bool(len(step.ids))
             after = self._after(step.blind)
         if after is not None:
             self._state, judged = after
