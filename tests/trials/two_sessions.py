@@ -43,8 +43,6 @@ from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Sample, opened
 from tests.central.test_saved_map import changed, day, part
 
-EMPTY: Mapping[int, int] = {}
-
 
 class Session(NamedTuple):
     scenario: Scenario
@@ -152,7 +150,7 @@ def most_observed(world: WorldStreams, since_ns: dict[str, int], known: set[int]
 
 
 def row(
-    name: str, samples: Sequence[Sample], world: WorldStreams, before: Mapping[int, int] = EMPTY
+    name: str, samples: Sequence[Sample], world: WorldStreams, before: Mapping[int, int]
 ) -> Figures:
     fused = final_map(samples)
     found = figures(fused, world, labels_of(samples, before))
@@ -165,7 +163,7 @@ def row(
 def joined(name: str, first: Session, second: Session, limit_m: float, by: np.ndarray) -> bool:
     """Run two sessions, also with a displaced landmark; return whether all bounds hold."""
     samples, centre, _ = day(1, scenario=first.scenario, streams=first.world)
-    of_first = row(f"{name}: first", samples, first.world)
+    of_first = row(f"{name}: first", samples, first.world, {})
     saved = centre.maps.fold.save_map("first")
     samples, _, _ = day(1, [saved], scenario=second.scenario, streams=second.world)
     both = row(f"{name}: joined", samples, second.world, of_first.truth)
@@ -261,7 +259,7 @@ def main() -> int:
     by = asked.by * np.array([0.8, -0.6])
     print("session                RMSE [m]   NEES (limit) landmarks changes")
     samples, _, _ = day(1, scenario=whole.scenario, streams=whole.world)
-    limit_m = 1.05 * row("whole", samples, whole.world).rmse
+    limit_m = 1.05 * row("whole", samples, whole.world, {}).rmse
     begins_ns, ends_ns = zip(*whole.world.spans_ns.values(), strict=True)
     first_ns, last_ns = min(begins_ns), max(ends_ns)
     middle_ns = (first_ns + last_ns) // 2
@@ -277,7 +275,7 @@ def main() -> int:
         second = of_robots(whole, names[1::2], begins=False)
         reference = in_one(whole, (first, second))
         samples, _, _ = day(1, scenario=reference.scenario, streams=reference.world)
-        of_both = row("robots: whole", samples, reference.world)
+        of_both = row("robots: whole", samples, reference.world, {})
         limit_m = 1.05 * of_both.rmse
         is_good &= joined("robots", first, second, limit_m, by)
     return int(not is_good)

@@ -196,12 +196,9 @@ def find_closure(
         ),
         llr=best.merged.llr,
         absent=best.absent,
-        rival_pairs=0,
-        rival_llr=0.0,
         share=matched_share(mean[patch.at], mean[best.target.at], places, profile),
         sd=max(pair.sd for pair in best.merged.pairs),
         motion=best.motion,
-        why="",
     )
     for rivals in (lambda: others, aliases):
         closure = _compare_with_rivals(closure, rivals())
@@ -462,13 +459,9 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
             return Closure(
                 pairs=found.pairs,
                 llr=sum(pair.llr for pair in found.pairs),
-                absent=0,
-                rival_pairs=0,
-                rival_llr=0.0,
                 share=share,
                 sd=sd,
                 motion=np.zeros(3),
-                why="",
             )
     return None
 

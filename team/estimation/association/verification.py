@@ -36,13 +36,13 @@ class Closure(NamedTuple):
 
     pairs: tuple[Pair, ...]
     llr: float
-    absent: int
-    rival_pairs: int
-    rival_llr: float
     share: float
     sd: float
     motion: Float[np.ndarray, "3"]
-    why: str
+    absent: int = 0
+    rival_pairs: int = 0
+    rival_llr: float = 0.0
+    why: str = ""
 
 
 class ClosureTests(NamedTuple):

@@ -58,6 +58,8 @@ WELL_OBSERVED = 4
 """Least submaps of a landmark whose residuals show how far right associations are off."""
 LEAST_RESIDUALS = 30
 """Least number of these residuals from which their scale is learnt."""
+LEAST_SCALE = 0.1
+"""Least scale of residuals: data without noise have none."""
 
 
 def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
@@ -72,18 +74,16 @@ def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
     graph, settings = island.graph, island.settings
     chi2 = graph.factors.landmark_chi2(island.state, settings.covariance_factor)
     nodes = np.concatenate([each.landmarks for each in graph.submaps])
-    is_saved = np.concatenate(
-        [np.full(len(s.landmarks), is_map(s.contribution.stream)) for s in graph.submaps]
-    )
+    saved = np.isin(nodes, [n for k in graph.saved_maps for n in graph.submaps[k].landmarks])
     counts = np.bincount(nodes[nodes >= 0], minlength=len(graph.fixed))
     unnamed = np.isin(nodes, [node for id_, node in graph.landmarks.items() if id_ >= UNNAMED])
-    sound = chi2[unnamed & ~is_saved & (counts[nodes] >= WELL_OBSERVED)]
+    sound = chi2[unnamed & ~saved & (counts[nodes] >= WELL_OBSERVED)]
     if len(sound) < LEAST_RESIDUALS:
         return []
-    scale = min(float(np.median(sound)) / (2.0 * core.log(2.0)), 1.0)
+    scale = max(min(float(np.median(sound)) / (2.0 * core.log(2.0)), 1.0), LEAST_SCALE)
     agrees = (chi2 <= scale * settings.landmark_gate) & (nodes >= 0)
     enough = np.bincount(nodes[agrees], minlength=len(counts)) >= least
-    enough[nodes[is_saved & (nodes >= 0)]] = True
+    enough[nodes[saved & (nodes >= 0)]] = True
     judged = fold.landmarks.judged()
     unnamed_ids = (id_ for id_ in sorted({*ids} - judged) if id_ >= UNNAMED)
     return [id_ for id_ in unnamed_ids if not enough[graph.landmarks[id_]]]
@@ -362,12 +362,8 @@ def log_by_chance(n: int, others: Float[np.ndarray, "N 2"], matched: int, radius
     p = min(math.pi * core.squared(radius) * count / area, 1.0 - 1e-9)
     left, least = n - 2, matched - 2
     terms: Int64[np.ndarray, " k"] = np.arange(least, left + 1)
-    logs = np.array([_log_choose(left, int(k)) for k in terms])
+    logs = np.array([core.log(float(math.comb(left, int(k)))) for k in terms])
     logs = logs + terms * core.log(p) + (left - terms) * core.log(1.0 - p)
     most = float(logs.max())
     tail = most + core.log(float(core.exp(logs - most).sum()))
     return tail + core.log(float(n * (n - 1)) * count * (count - 1))
-
-
-def _log_choose(n: int, k: int) -> float:
-    return core.log(float(math.comb(n, k)))

@@ -14,13 +14,9 @@ PAIRS = 7
 FOUND = Closure(
     pairs=tuple(Pair(k, 10 + k, llr=9.0, sd=0.5, rival=0.0) for k in range(PAIRS)),
     llr=60.0,
-    absent=0,
-    rival_pairs=0,
-    rival_llr=0.0,
     share=1.0,
     sd=0.5,
     motion=np.zeros(3),
-    why="",
 )
 
 

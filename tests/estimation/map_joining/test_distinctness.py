@@ -54,6 +54,20 @@ def member(sequence: int, local: int) -> LocalLandmark:
     return LocalLandmark("r1", 1, sequence, local)
 
 
+@pytest.mark.parametrize("off", [0.0, 0.045])
+def test_a_landmark_whose_submaps_disagree_at_the_scale_of_the_others_is_left_out(off: float):
+    """Two submaps contain the last one; the others' residuals are far below the covariance."""
+    fold, others = EMPTY_FOLD, [(2.0 * x, y) for x in range(3) for y in (-2.0, 2.0)]
+    for k in range(6):
+        places = [*others, (9.0, off * (k == 5))] if k >= 4 else others
+        fold = fold_tick(fold, Tick([seen(k, places, SD)]), JoinSettings())
+    last = fold.landmarks.identity(member(4, 6))
+    assert last == fold.landmarks.identity(member(5, 6))
+    shown = shown_landmarks(fold, CentralConfig(), "final")
+    assert (last in shown.ids) == (off == 0.0)
+    assert len({*shown.ids} - {last}) == len(others)
+
+
 def test_what_may_be_either_of_two_neighbours_is_no_third_landmark():
     fold = folded((2.0, 0.1))
     one, two, third = (fold.landmarks.identity(member(*at)) for at in ((0, 0), (0, 1), (2, 0)))
