@@ -3,7 +3,7 @@
 The numbers of an array are encoded as its field's are.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from typing import Any, TypeVar
 
@@ -30,6 +30,7 @@ ORDINARY: dict[str, Any] = {
 }  # fmt: skip
 ENCODED: dict[str, Callable[[Any], bytes]] = {
     **dict.fromkeys(("ids", "counts", "rows", "landmarks", "labels"), from_ids),
+    **dict.fromkeys(("sequences", "locals", "identities"), from_ids),
     **dict.fromkeys(("stamps", "nodes"), from_stamps),
 }
 """All other arrays are of floats."""
@@ -40,54 +41,54 @@ def _arrays_of(kind: type[msgspec.Struct]) -> frozenset[str]:
     return frozenset(field.name for field in msgspec.structs.fields(kind) if field.type is bytes)
 
 
-def _built(kind: Callable[..., M], **fields: object) -> M:
+def built(kind: Callable[..., M], ordinary: Mapping[str, Any] = ORDINARY, **fields: object) -> M:
     names: tuple[str, ...] = getattr(kind, "__struct_fields__")  # noqa: B009 - msgspec's
     required = names[: len(names) - len(getattr(kind, "__struct_defaults__"))]  # noqa: B009
-    values = {name: ORDINARY[name] for name in required if name in ORDINARY} | fields
+    values = {name: ordinary[name] for name in required if name in ordinary} | fields
     if "node" in required and "node" not in values:
-        values["node"] = f"robot/{values.get('robot', 'r1')}"
-    for name in _arrays_of(kind) & fields.keys():
-        if not isinstance(fields[name], bytes):
-            values[name] = ENCODED.get(name, from_floats)(fields[name])
+        values["node"] = f"robot/{values.get('robot', ordinary['robot'])}"
+    for name in _arrays_of(kind) & values.keys():
+        if not isinstance(values[name], bytes):
+            values[name] = ENCODED.get(name, from_floats)(values[name])
     return kind(**values)
 
 
-initial_pose = partial(_built, m.InitialPose)
-odometry = partial(_built, m.Odometry)
-observations = partial(_built, m.Observations)
-liveliness = partial(_built, m.Liveliness)
-progress = partial(_built, m.Progress)
-done = partial(_built, m.Done)
-submap = partial(_built, m.Submap)
-sighting_factor = partial(_built, m.SightingFactor)
-map_estimate = partial(_built, m.MapEstimate)
-pose_estimate = partial(_built, m.PoseEstimate)
-prior = partial(_built, m.Prior)
-fused_map = partial(_built, m.FusedMap)
-configuration = partial(_built, m.Configuration)
-status = partial(_built, m.Status)
-withdrawal = partial(_built, m.Withdrawal)
-measurements_request = partial(_built, m.MeasurementsRequest)
-submaps_request = partial(_built, m.SubmapsRequest)
-increment = partial(_built, m.Increment)
-points = partial(_built, m.Points)
-detections = partial(_built, m.Detections)
-sightings = partial(_built, m.Sightings)
-truth = partial(_built, m.Truth)
-trajectory = partial(_built, m.Trajectory)
-given_up = partial(_built, m.GivenUp)
-team_end = partial(_built, m.TeamEnd)
-withdrawal_heard = partial(_built, m.WithdrawalHeard)
-concluded = partial(_built, m.Concluded)
-set_summary = partial(_built, m.SetSummary)
-members_request = partial(_built, m.MembersRequest)
-members = partial(_built, m.Members)
-kept = partial(_built, m.Kept)
-kept_request = partial(_built, m.KeptRequest)
-tally = partial(_built, m.Tally)
-fault = partial(_built, m.Fault)
-holding = partial(_built, m.Holding)
-requested = partial(_built, m.Requested)
+initial_pose = partial(built, m.InitialPose)
+odometry = partial(built, m.Odometry)
+observations = partial(built, m.Observations)
+liveliness = partial(built, m.Liveliness)
+progress = partial(built, m.Progress)
+done = partial(built, m.Done)
+submap = partial(built, m.Submap)
+sighting_factor = partial(built, m.SightingFactor)
+map_estimate = partial(built, m.MapEstimate)
+pose_estimate = partial(built, m.PoseEstimate)
+prior = partial(built, m.Prior)
+fused_map = partial(built, m.FusedMap)
+configuration = partial(built, m.Configuration)
+status = partial(built, m.Status)
+withdrawal = partial(built, m.Withdrawal)
+measurements_request = partial(built, m.MeasurementsRequest)
+submaps_request = partial(built, m.SubmapsRequest)
+increment = partial(built, m.Increment)
+points = partial(built, m.Points)
+detections = partial(built, m.Detections)
+sightings = partial(built, m.Sightings)
+truth = partial(built, m.Truth)
+trajectory = partial(built, m.Trajectory)
+given_up = partial(built, m.GivenUp)
+team_end = partial(built, m.TeamEnd)
+withdrawal_heard = partial(built, m.WithdrawalHeard)
+concluded = partial(built, m.Concluded)
+set_summary = partial(built, m.SetSummary)
+members_request = partial(built, m.MembersRequest)
+members = partial(built, m.Members)
+kept = partial(built, m.Kept)
+kept_request = partial(built, m.KeptRequest)
+tally = partial(built, m.Tally)
+fault = partial(built, m.Fault)
+holding = partial(built, m.Holding)
+requested = partial(built, m.Requested)
 
 
 def end(stamp_ns: int = 0, incarnation: int = 1, **measurements: int) -> m.End:

@@ -12,7 +12,7 @@ import numpy as np
 
 from teamslam.team.config import UNNAMED
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
+from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Bus, Sample
 from teamslam.team.wire.channels import Channel
 from tests import build
@@ -164,224 +164,95 @@ def on_its_key(channel: Channel, name: str, message: m.Message) -> m.Message:
     )
 
 
-def peers_examples(digest: bytes) -> Iterator[m.Message]:
-    holding = build.holding(robot="alpha", sequences=(0, 4, 6, 6), digest=digest, newest_ns=9)
-    statements = m.Statements(robot="alpha", count=2, digest=digest)
-    yield build.set_summary(
-        stamp_ns=9,
-        node="robot/bravo",
-        serial=3,
-        digest=digest,
-        holdings=(holding,),
-        statements=(statements,),
-    )
-    wanted = build.requested(robot="alpha", start=False, first=5, last=5)
-    yield build.members_request(
-        stamp_ns=9, node="robot/bravo", requested=(wanted,), statements=("alpha",)
-    )
-    yield build.members(
-        stamp_ns=9,
-        node="robot/alpha",
-        keys=("robot/alpha/submap",),
-        payloads=(b"bytes",),
-        signatures=(b"",),
-    )
-    yield m.Certificate(stamp_ns=0, robot="alpha", certificate=b"DER")
-    yield m.Signature(stamp_ns=9, robot="alpha", member=4 * digest, signature=b"ECDSA")
-    yield m.RadioPlan(stamp_ns=0, robots=("alpha", "bravo"), ends_ns=(9, 8), pairs=b"\x80\x00")
-    yield build.concluded(
-        stamp_ns=9, robot="alpha", serial=1, digest=digest, sha256=4 * digest, submaps=7
-    )
+DIGEST = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
+ALPHA = build.ORDINARY | {
+    "stamp_ns": 9_000, "robot": "alpha", "sequence": 5, "number": 3, "duration_ns": 100_000_000,
+    "digest": DIGEST, "config": DIGEST, "map_digest": DIGEST, "sha256": 4 * DIGEST,
+    "ids": [4, 7], "means": [1.0, 2.0, 3.0, 4.0], "positions": [1.0, 2.0, 3.0, 4.0],
+    "ranges": [2.0, 3.5], "bearings": [0.5, -1.0], "covariances": [2.0, 0.5, 1.0] * 2,
+    "pose": [1.0, -0.5, 0.25], "increment": [1.0, -0.5, 0.25], "covariance": spd(3),
+    "measurements": 200, "reason": "its wheel is flat", "state": "open",
+    "value": 0.25, "sigma": 0.125, "same": True,
+}  # fmt: skip
+alpha = partial(build.built, ordinary=ALPHA)
+CLASSES = [-0.25, -1.5, -2.0, -0.125]
 
 
-def examples() -> Iterator[m.Message]:
-    two, three = from_ids([4, 7]), from_floats([1.0, -0.5, 0.25])
-    means, blocks = from_floats([1.0, 2.0, 3.0, 4.0]), from_floats([2.0, 0.5, 1.0] * 2)
-    digest = b"\x00\x01\x02\x03\xfc\xfd\xfe\xff"
-    member = m.VersionEntry(robot="alpha", incarnation=1, sequence=5)
-    yield build.initial_pose(robot="alpha", pose=three, covariance=spd(3))
-    yield build.odometry(
-        stamp_ns=1_000,
-        robot="alpha",
-        number=2,
-        duration_ns=100_000_000,
-        forward=0.25,
-        yaw_rate=-0.125,
-    )
-    yield build.increment(
-        stamp_ns=1_000,
-        robot="alpha",
-        number=2,
-        duration_ns=100_000_000,
-        increment=three,
-        covariance=spd(3),
-    )
-    yield m.Steering(
-        stamp_ns=1_000,
-        robot="alpha",
-        incarnation=1,
-        number=2,
-        duration_ns=100_000_000,
-        wheel_speed=2.5,
-        steering=-0.125,
-    )
-    yield build.observations(
-        stamp_ns=2_000,
-        robot="alpha",
-        number=3,
-        ids=two,
-        ranges=[2.0, 3.5],
-        bearings=[0.5, -1],
-        covariances=blocks,
-    )
-    yield build.points(
-        stamp_ns=2_000, robot="alpha", number=3, ids=two, positions=means, covariances=blocks
-    )
-    yield build.detections(
+def place(sequence: int, local: int, robot: str = "alpha") -> m.LocalLandmark:
+    return alpha(m.LocalLandmark, robot=robot, sequence=sequence, local=local)
+
+
+def measured_examples() -> Iterator[m.Message]:
+    yield alpha(m.InitialPose, stamp_ns=0, number=0)
+    yield alpha(m.Odometry, stamp_ns=1_000, number=2, forward=0.25, yaw_rate=-0.125)
+    yield alpha(m.Increment, stamp_ns=1_000, number=2, covariance=spd(3))
+    yield alpha(m.Steering, stamp_ns=1_000, number=2, wheel_speed=2.5, steering=-0.125)
+    yield alpha(m.Observations, stamp_ns=2_000, covariances=ALPHA["covariances"])
+    yield alpha(m.Points, stamp_ns=2_000, covariances=ALPHA["covariances"])
+    yield alpha(
+        m.Detections,
         stamp_ns=2_500,
-        robot="alpha",
-        number=3,
-        ranges=[2.0, 3.5],
-        bearings=[0.5, -1],
-        covariances=blocks,
+        covariances=ALPHA["covariances"],
         signatures=[0.25, 0.5],
-        classes=[-0.25, -1.5, -2.0, -0.125],
+        classes=CLASSES,
     )
-    yield build.sightings(
-        stamp_ns=3_000, robot="alpha", number=4, teammates=("bravo",), ranges=[6.0], bearings=[-3.0]
+    yield alpha(
+        m.Sightings,
+        stamp_ns=3_000,
+        number=4,
+        teammates=("bravo",),
+        ranges=[6.0],
+        bearings=[-3.0],
     )
-    yield build.truth(stamp_ns=4_000, robot="alpha", stamps=[0, 4_000], poses=range(6))
-    yield m.TruthLandmarks(stamp_ns=-5, ids=two, positions=means)
-    yield m.TruthLabels(
-        stamp_ns=-5,
-        robot="alpha",
-        stamps=from_stamps([2_500]),
-        counts=from_ids([2]),
-        labels=from_ids([7, m.NO_LABEL]),
-    )
-    yield m.TruthPositions(
-        stamp_ns=-5,
-        robot="alpha",
-        stamps=from_stamps([0, 4_000]),
-        positions=from_floats([0.0, 0.5, 1.0, 1.5]),
-    )
-    yield m.KnownMap(stamp_ns=-5, ids=two, positions=means)
-    yield build.configuration(node="robot/alpha", digest=digest, configuration='{"seed": 7}')
-    yield build.submap(
-        stamp_ns=9_000,
-        robot="alpha",
-        sequence=5,
-        first_measurement=10,
-        last_measurement=19,
-        start_ns=8_000,
-        config=digest,
-        ids=[4, UNNAMED + 1],
-        mean=range(10),
-        covariance=packed(spd(10)),
-        nodes=[8_500],
-        sightings=1,
-        biases=("bearing", "range_scale"),
-        sensitivity=np.arange(20) / 16.0,
-        gated=3,
-        counts=[6],
-        seen=b"\x05\x01",
-        keyframes=9,
-        classes=[-0.25, -1.5, -2.0, -0.125],
-    )
-    yield m.Association(
-        stamp_ns=9_000,
-        robot="alpha",
-        incarnation=1,
-        sequence=5,
-        stamps=from_stamps([8_200, 8_400]),
-        counts=from_ids([1, 2]),
-        rows=from_ids([0, 0, 2]),
-        landmarks=from_ids([UNNAMED + 1, m.CLUTTER, m.UNCONFIRMED]),
-    )
-    yield build.sighting_factor(
-        stamp_ns=8_500,
-        robot="alpha",
-        sequence=5,
-        config=digest,
-        teammate="bravo",
-        range=6.0,
-        bearing=-3.0,
-        covariance=packed(spd(2)),
-        measurements=(12, 14),
-    )
-    yield build.withdrawal(stamp_ns=9_000, robot="alpha", reason="its wheel is flat")
-    yield m.Verdict(
-        stamp_ns=0,
-        robot="alpha",
-        judgement=m.Judgement(
-            first=m.LocalLandmark(robot="alpha", incarnation=1, sequence=3, local=5),
-            second=m.LocalLandmark(robot="beta", incarnation=1, sequence=8, local=0),
-            same=True,
-        ),
-        by="operator",
-        reason="the same tree",
-    )
-    yield build.withdrawal_heard(
-        stamp_ns=9_000, robot="alpha", withdrawn="bravo", reason="its wheel is flat"
-    )
-    yield build.map_estimate(
-        stamp_ns=9_000,
-        robot="alpha",
-        sequence=5,
-        joint=False,
-        ids=two,
-        means=means,
-        covariance=blocks,
-    )
-    yield build.pose_estimate(
-        stamp_ns=9_000,
-        robot="alpha",
-        sequence=5,
-        map_digest=digest,
-        pose=three,
-        covariance=spd(3),
-        frame="bravo/1",
-        in_team_frame=False,
-    )
-    yield m.ParticleCloud(
-        stamp_ns=9_000,
-        robot="alpha",
-        poses=from_floats(range(6)),
-        weights=from_floats([0.25, 0.75]),
-    )
-    yield m.Innovation(
-        stamp_ns=9_000, robot="alpha", incarnation=1, sequence=5, squared=20.5, dof=22
-    )
-    yield build.fused_map(
-        stamp_ns=9_000,
-        digest=digest,
+    yield alpha(m.Truth, stamp_ns=4_000, stamps=[0, 4_000], poses=range(6))
+    yield alpha(m.TruthLandmarks, stamp_ns=-5)
+    yield alpha(m.TruthLabels, stamp_ns=-5, stamps=[2_500], counts=[2], labels=[7, m.NO_LABEL])
+    yield alpha(m.TruthPositions, stamp_ns=-5, stamps=[0, 4_000], positions=[0.0, 0.5, 1.0, 1.5])
+    yield alpha(m.KnownMap, stamp_ns=-5)
+    yield alpha(m.Fix, number=7, position=[3.0, 4.0], covariance=[4.0, 0.0, 4.0])
+
+
+def peers_examples() -> Iterator[m.Message]:
+    holding = alpha(m.Holding, sequences=(0, 4, 6, 6), newest_ns=9)
+    statements = alpha(m.Statements, count=2)
+    bravo = {"stamp_ns": 9, "node": "robot/bravo"}
+    yield alpha(m.SetSummary, **bravo, serial=3, holdings=(holding,), statements=(statements,))
+    wanted = alpha(m.Requested, start=False, first=5, last=5)
+    yield alpha(m.MembersRequest, **bravo, requested=(wanted,), statements=("alpha",))
+    keys = ("robot/alpha/submap",)
+    yield alpha(m.Members, stamp_ns=9, keys=keys, payloads=(b"bytes",), signatures=(b"",))
+    yield alpha(m.Certificate, stamp_ns=0, certificate=b"DER")
+    yield alpha(m.Signature, stamp_ns=9, member=4 * DIGEST, signature=b"ECDSA")
+    yield m.RadioPlan(stamp_ns=0, robots=("alpha", "bravo"), ends_ns=(9, 8), pairs=b"\x80\x00")
+    yield alpha(m.Concluded, stamp_ns=9, serial=1, submaps=7)
+
+
+def map_examples() -> Iterator[m.Message]:
+    member = alpha(m.VersionEntry)
+    yield alpha(
+        m.FusedMap,
         frame="alpha/1",
         final=True,
         members=(member,),
-        missing=(m.VersionEntry(robot="bravo", incarnation=0, sequence=2),),
-        ids=two,
-        means=means,
+        missing=(alpha(m.VersionEntry, robot="bravo", incarnation=0, sequence=2),),
         covariance=packed(spd(4)),
         chi2=12.5,
         dof=14,
         reasons=("bravo: 1 shared landmark, 2 needed",),
-        biases=(
-            m.BiasEstimate(robot="alpha", incarnation=1, bias="bearing", value=0.25, sigma=0.125),
-        ),
+        biases=(alpha(m.BiasEstimate, bias="bearing"),),
         joined=("charlie joined: 5 landmarks",),
         withdrawn=("charlie",),
         covariance_scale=1.25,
         lost=(),
         heard=9,
         memberships=(
-            m.Membership(
-                robot="alpha",
-                incarnation=1,
-                sequences=from_ids(np.array([0, 1], np.uint32)),
-                locals=from_ids(np.array([4, 2], np.uint32)),
-                identities=from_ids(np.array([2**31 + 7, 2**31 + 7], np.uint32)),
+            alpha(
+                m.Membership,
+                sequences=[0, 1],
+                locals=[4, 2],
+                identities=[2**31 + 7, 2**31 + 7],
                 steps=bytes([0, 1]),
-                figures=from_floats(np.array([0.0, 0.0, 0.0, 5.5, -2.0, 0.25])),
+                figures=[0.0, 0.0, 0.0, 5.5, -2.0, 0.25],
             ),
         ),
         decisions=(
@@ -409,118 +280,132 @@ def examples() -> Iterator[m.Message]:
                 at_ns=150 * 10**9,
             ),
         ),
-        verdicts=(
-            m.Judgement(
-                first=m.LocalLandmark(robot="alpha", incarnation=1, sequence=0, local=4),
-                second=m.LocalLandmark(robot="alpha", incarnation=1, sequence=1, local=2),
-                same=True,
-            ),
-        ),
+        verdicts=(m.Judgement(first=place(0, 4), second=place(1, 2), same=True),),
         changes=(
             m.LandmarkChange(landmark=4, state="moved", dx=0.5, dy=-0.25, sigma=0.125, chi2=17.0),
             m.LandmarkChange(landmark=7, state="gone", expected=9.5),
         ),
     )
-    yield m.SavedMap(
-        stamp_ns=9_000,
+    own = {"alpha": "range_offset", "beta": "forward_scale"}
+    yield alpha(
+        m.SavedMap,
         name="site",
-        ids=from_ids([4, UNNAMED]),
-        means=means,
+        ids=[4, UNNAMED],
         covariance=packed(spd(4)),
         biases=("range_scale",),
-        sensitivity=means,
-        counts=from_ids([3, 1]),
+        sensitivity=ALPHA["means"],
+        counts=[3, 1],
         frame="alpha/1",
-        sets=(digest,),
+        sets=(DIGEST,),
         software="1.2.3",
         core="0123456789abcdef",
-        datum=from_floats([48.5, 9.25, 512.0]),
-        own=(
-            m.RobotBias(robot="alpha", bias="range_offset"),
-            m.RobotBias(robot="beta", bias="forward_scale"),
-        ),
-        own_means=from_floats([0.5, -0.25]),
-        own_covariance=from_floats([2.0, 0.5, 1.0]),
-        own_cross=from_floats([0.125, 0.0, -0.125, 0.25, 0.0, 0.125, 0.0, -0.25]),
-        own_sensitivity=from_floats([1.0, -2.0]),
-        likeliest=from_floats([0.25, 0.5, -0.25]),
+        datum=[48.5, 9.25, 512.0],
+        own=tuple(m.RobotBias(robot=robot, bias=bias) for robot, bias in own.items()),
+        own_means=[0.5, -0.25],
+        own_covariance=[2.0, 0.5, 1.0],
+        own_cross=[0.125, 0.0, -0.125, 0.25, 0.0, 0.125, 0.0, -0.25],
+        own_sensitivity=[1.0, -2.0],
+        likeliest=[0.25, 0.5, -0.25],
         evidence=packed(spd(3)),
-        classes=from_floats([-0.25, -1.5]),
+        classes=CLASSES[:2],
     )
-    yield build.prior(
-        stamp_ns=9_000,
-        robot="alpha",
-        sequence=5,
-        digest=digest,
-        ids=two,
+    yield alpha(
+        m.Prior,
         mean=range(7),
         covariance=packed(spd(7)),
         covariance_factor=2.5,
-        biases=(
-            m.BiasEstimate(
-                robot="alpha", incarnation=1, bias="range_scale", value=0.25, sigma=0.125
-            ),
-        ),
+        biases=(alpha(m.BiasEstimate, bias="range_scale"),),
         members=(member,),
         heard=9,
         withdrawn=1,
         frame="bravo/1",
         in_team_frame=True,
     )
-    yield build.trajectory(
-        stamp_ns=9_000,
-        robot="alpha",
-        digest=digest,
+
+
+def robot_examples() -> Iterator[m.Message]:
+    yield alpha(
+        m.Submap,
+        first_measurement=10,
+        last_measurement=19,
+        start_ns=8_000,
+        ids=[4, UNNAMED + 1],
+        mean=range(10),
+        covariance=packed(spd(10)),
+        nodes=[8_500],
+        sightings=1,
+        biases=("bearing", "range_scale"),
+        sensitivity=np.arange(20) / 16.0,
+        gated=3,
+        counts=[6],
+        seen=b"\x05\x01",
+        keyframes=9,
+        classes=CLASSES,
+    )
+    yield alpha(
+        m.Association,
+        stamps=[8_200, 8_400],
+        counts=[1, 2],
+        rows=[0, 0, 2],
+        landmarks=[UNNAMED + 1, m.CLUTTER, m.UNCONFIRMED],
+    )
+    yield alpha(
+        m.SightingFactor,
+        stamp_ns=8_500,
+        teammate="bravo",
+        range=6.0,
+        bearing=-3.0,
+        covariance=packed(spd(2)),
+        measurements=(12, 14),
+    )
+    yield alpha(m.MapEstimate, joint=False, covariance=ALPHA["covariances"])
+    yield alpha(m.PoseEstimate, frame="bravo/1", in_team_frame=False)
+    yield alpha(m.ParticleCloud, poses=range(6), weights=[0.25, 0.75])
+    yield alpha(m.Innovation, squared=20.5, dof=22)
+    yield alpha(
+        m.Trajectory,
         stamps=[9_000],
-        poses=three,
+        poses=ALPHA["pose"],
         covariances=spd(3),
         start=[0.5, 0.25, 0.125],
         start_covariance=spd(3),
         crosses=range(9),
     )
-    yield build.progress(stamp_ns=9_000, node="central", robot="alpha", measurements=128, submaps=6)
-    yield m.Rendezvous(
-        stamp_ns=9_000, robot="alpha", incarnation=1, teammates=("bravo",), submaps=3, waited_s=12.5
-    )
-    yield build.done(
-        stamp_ns=9_000,
-        robot="alpha",
-        measurements=200,
-        steps=99,
-        submaps=20,
-        ledger=(m.Disposition(disposition="in a submap", measurements=200),),
-        last_map=7,
-    )
-    yield m.End(
-        stamp_ns=9_000,
-        streams=(m.StreamEnd(robot="alpha", incarnation=1, measurements=200),),
-        notes=("gap of 3 s",),
-    )
-    yield m.StreamHead(stamp_ns=9_000, robot="alpha", incarnation=1, measurements=200, state="open")
-    yield m.Fix(
-        stamp_ns=9_000,
-        robot="alpha",
-        incarnation=1,
-        number=7,
-        position=from_floats([3.0, 4.0]),
-        covariance=from_floats([4.0, 0.0, 4.0]),
-    )
+    yield alpha(m.Rendezvous, teammates=("bravo",), submaps=3, waited_s=12.5)
+    ledger = (m.Disposition(disposition="in a submap", measurements=200),)
+    yield alpha(m.Done, steps=99, submaps=20, ledger=ledger, last_map=7)
+
+
+def examples() -> Iterator[m.Message]:
+    yield from measured_examples()
+    yield from peers_examples()
+    yield from map_examples()
+    yield from robot_examples()
+    yield alpha(m.Configuration, stamp_ns=0, configuration='{"seed": 7}')
+    yield alpha(m.Withdrawal)
+    same = m.Judgement(first=place(3, 5), second=place(8, 0, "beta"), same=True)
+    yield alpha(m.Verdict, stamp_ns=0, judgement=same, reason="the same tree")
+    yield alpha(m.WithdrawalHeard, withdrawn="bravo")
+    yield alpha(m.Progress, node="central", measurements=128, submaps=6)
+    yield alpha(m.End, streams=(alpha(m.StreamEnd),), notes=("gap of 3 s",))
+    yield alpha(m.StreamHead)
     yield build.team_end(reason="the batteries are empty")
-    yield build.status(
-        stamp_ns=9_000,
+    yield alpha(
+        m.Status,
         node="recorder",
         state="recording",
         figures={"messages": 12.0},
         warnings=("slow disk",),
         run="0123456789abcdef",
     )
-    yield build.given_up(stamp_ns=9_000, node="robot/alpha", reason="it fell into the water")
-    yield build.kept_request(channels=("final_map",), node="robot/alpha", run_ns=5_000_000_000)
-    yield build.kept(stamp_ns=9_000, key="central/final", payload=b"\x91\xc0", wall_ns=10**18)
+    yield alpha(m.GivenUp, reason="it fell into the water")
+    yield alpha(
+        m.KeptRequest, stamp_ns=0, node="robot/alpha", channels=("final_map",), run_ns=5_000_000_000
+    )
+    yield alpha(m.Kept, key="central/final", payload=b"\x91\xc0", wall_ns=10**18)
     yield m.FoldRequest(stamp_ns=0)
-    yield from peers_examples(digest)
-    yield build.fault(
-        stamp_ns=9_000,
+    yield alpha(
+        m.Fault,
         node="central",
         origin="robot/alpha/submap",
         count=7,
@@ -528,18 +413,12 @@ def examples() -> Iterator[m.Message]:
         error="ValueError",
         text="no frame",
         place="central.node:CentralNode.handle:58",
-        digest=b"\x01\x02\x03\x04\x05\x06\x07\x08",
+        digest=bytes(range(1, 9)),
     )
-    yield build.liveliness(node="robot/alpha")
-    yield build.tally(
-        stamp_ns=9_000,
-        node="robot/alpha",
-        since_ns=10**18,
-        keys=("robot/alpha/submap",),
-        counts=(6,),
-    )
-    yield build.measurements_request(robot="alpha", first=5)
-    yield build.submaps_request(robot="alpha")
+    yield alpha(m.Liveliness, stamp_ns=0)
+    yield alpha(m.Tally, since_ns=10**18, keys=("robot/alpha/submap",), counts=(6,))
+    yield alpha(m.MeasurementsRequest, stamp_ns=0, first=5)
+    yield alpha(m.SubmapsRequest, stamp_ns=0)
 
 
 K = TypeVar("K", bound=m.Message)
