@@ -1,9 +1,8 @@
-"""Landmarks that robots should have observed and have not.
+"""Expected observations of landmarks that robots have not observed.
 
-The probability p(d) to observe a landmark at distance d from a submap's path is learnt from the
-robots' own landmarks. One of a saved map at distances d_s is expected Σ p(d_s) times, each at most
-that of a window beside it (`visibility.OVERLOOKED`), and missed by all with probability
-Π (1 − p(d_s)).
+The probability p(d) to observe a landmark at distance d from a submap's path is estimated from the
+robots' own landmarks. A landmark at distances d_s is expected Σ p(d_s) times, with each p at most 1
+− `visibility.OVERLOOKED`, and missed by all submaps with probability Π (1 − p(d_s)).
 """
 
 from collections.abc import Sequence
@@ -19,23 +18,20 @@ from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.shapes import Bool, Float
 
-BINS = 8
-"""Number of distances at which the probability of an observation is learnt."""
-REACH = 0.95
-"""Share of today's observations that are nearer than the farthest distance."""
-STEPS = 4
-"""Points of a path between two poses."""
+BINS = 8  # number of distances at which the probability of an observation is learnt
+REACH = 0.95  # share of today's observations that are nearer than the farthest distance
+STEPS = 4  # points between two poses of a path
 
 
 class Absence(NamedTuple):
-    """Expected number of observations of a landmark, and the probability of none."""
+    """Expected number of observations, and the probability of none."""
 
     expected: float
     chance: float
 
 
 def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
-    """Compute the expected observations of places at which nothing was observed."""
+    """Compute the expected observations of places without any."""
     submaps = [each for each in island.graph.submaps if not is_map(each.contribution.stream)]
     nodes = sorted({node for each in submaps for node in each.landmarks.tolist()})
     if not nodes:
@@ -53,24 +49,24 @@ def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
 
 
 class DetectionRate(NamedTuple):
-    """Probability to observe a landmark by its distance from a path, between edges [m]; 0 beyond
-    the last.
+    """Probability to observe a landmark in each bin of distance [m] from a path; 0 beyond the last
+    edge.
     """
 
     edges: Float[np.ndarray, " bins"]
     rates: Float[np.ndarray, " _"]
 
     def at(self, away: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Return the probability at distances [m]."""
+        """Return the probability at each distance [m]."""
         return np.asarray(self.rates[np.searchsorted(self.edges, away)])
 
 
 def learn_rate(
     away: Float[np.ndarray, " N"], seen: Bool[np.ndarray, " N"], unseen: float = 0.0
 ) -> DetectionRate:
-    """Learn the rate from distances [m] of landmarks and whether each was observed.
+    """Estimate the rate from distances [m] of landmarks and whether each was observed.
 
-    unseen: number of missed landmarks that each bin begins with.
+    unseen: missed landmarks added to each bin.
     """
     edges = np.quantile(away[seen], REACH * np.arange(1, BINS + 1) / BINS)
     of = np.searchsorted(edges, away)
@@ -80,7 +76,7 @@ def learn_rate(
 
 
 def path_of(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
-    """Return points of a submap's path [m]."""
+    """Sample points [m] of a submap's path."""
     poses = len(submap.contribution.local.node_stamps)
     start, end, *between = submap.nodes[: 2 + poses].tolist()
     at = island.graph.offset[[start, *between, end]]
@@ -93,7 +89,7 @@ def path_of(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
 def distances(
     path: Float[np.ndarray, "K 2"], points: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, " n"]:
-    """Return the distance [m] of each point from the nearest one of a path."""
+    """Compute the distance [m] of each point from the nearest point of a path."""
     x, y = (points[:, None] - path).transpose(2, 0, 1)
     nearest: Float[np.ndarray, " n"] = core.hypot(x, y).min(axis=1)
     return nearest

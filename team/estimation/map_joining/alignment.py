@@ -1,8 +1,8 @@
 """Align two maps by their common points.
 
-Weighted Procrustes alignment (Downs' thesis; Arun, Huang & Blostein 1987) gives the first guess,
-Gauss-Newton in the metric of both joint covariances refines it. Agreement is tested on the joint
-cost, which is not linearised about a drifted map.
+Weighted Procrustes alignment (Arun, Huang & Blostein 1987) gives the first guess; Gauss-Newton
+refines it in the metric of both joint covariances. The joint cost, which is not linearised about a
+drifted map, tests the agreement.
 """
 
 from typing import NamedTuple
@@ -17,18 +17,17 @@ from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.shapes import Float
 
 ITERATIONS = 10
-NEEDED = 2
-"""Number of points that determine a rigid motion in the plane."""
+NEEDED = 2  # number of points that determine a rigid motion in the plane
 
 
 class Alignment(NamedTuple):
-    """The rigid motion a_from_b (x [m], y [m], theta [rad]), its covariance and the χ² of its
+    """Rigid motion a_from_b (x [m], y [m], theta [rad]) with covariance, and the χ² of its
     residuals.
 
-    dof: of `chi2`, 2 per shared landmark less 3. heading_sigma: standard deviation [rad] of the
-    heading from the shape of the shared landmarks. Unlike `covariance` it leaves out the rotation
-    of each map as a whole: √(tr(Π S Π)/dof / Σ‖bᵢ − b̄‖²), with the difference's covariance S and
-    the projection Π off the rigid motions.
+    dof: of `chi2`, 2 per landmark less 3. heading_sigma: standard deviation [rad] of the heading
+    from the shape of the landmarks alone, without the rotation of each map as a whole: √(tr(Π S
+    Π)/dof / Σ‖bᵢ − b̄‖²), with the covariance S of the difference and the projection Π off the
+    rigid motions.
     """
 
     a_from_b: Float[np.ndarray, "3"]
@@ -63,9 +62,9 @@ def align(
     """Estimate the most likely a_from_b of two independent Gaussian maps of the same n ≥ 2
     landmarks.
 
-    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d with d = a − (R b + t), the metric taken at each iterate, about
-    the centroids: conditioning does not depend on the origins. Points at one place leave the
-    heading at 0 and `heading_sigma` infinite. Raises NotACovarianceError.
+    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d, d = a − (R b + t), about the centroids, with the metric of each
+    iterate. If the points coincide, the heading is 0 and `heading_sigma` infinite. Raises
+    NotACovarianceError.
     """
     n = len(in_a)
     variances = np.diag(covariance_a) + np.diag(covariance_b)
@@ -109,7 +108,7 @@ def fit_at_heading(
     covariance_b: Float[np.ndarray, "m m"],
     heading: float,
 ) -> tuple[Float[np.ndarray, "2"], float]:
-    """Fit the translation [m] of a_from_b at a given heading, with its χ²."""
+    """Fit the translation [m] of a_from_b at a given heading; return it with its χ²."""
     pose = np.array([0.0, 0.0, heading])
     residual, metric, jacobian = _linearise(pose, in_a, covariance_a, in_b, covariance_b)
     J = jacobian[:, :2]
@@ -142,7 +141,7 @@ def _linearise(
     in_b: Float[np.ndarray, "n 2"],
     covariance_b: Float[np.ndarray, "m m"],
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
-    """Return the differences d, (P_a + R P_b Rᵀ)⁻¹ and the Jacobian ∂(R b + t)/∂(t, θ)."""
+    """Return the differences d, (P_a + R P_b Rᵀ)⁻¹ and ∂(R b + t)/∂(t, θ)."""
     n = len(in_a)
     s, c = core.sin_and_cos(a_from_b[2])
     rotation = np.array([[c, -s], [s, c]])
@@ -159,7 +158,7 @@ def _linearise(
 
 
 class SharedPoints(NamedTuple):
-    """Numbers of shared landmarks, and of teammates observed from one of the maps."""
+    """Numbers of shared landmarks and of teammates observed from either map."""
 
     landmarks: int
     sightings: int = 0
@@ -172,7 +171,7 @@ class SharedPoints(NamedTuple):
 
 
 def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: float) -> str | None:
-    """Give the reason why the shared points cannot place one map in the other."""
+    """Return why the shared points cannot place one map in the other, or None."""
     if alignment is None:
         return f"{shared}, {NEEDED} needed"
     if alignment.heading_sigma == np.inf:
@@ -186,10 +185,10 @@ def refusal(shared: SharedPoints, alignment: Alignment | None, heading_sigma: fl
 
 
 def disagreement(shared: SharedPoints, chi2: float, confidence: float) -> str | None:
-    """Give the reason why two maps with these shared points cannot be of one place.
+    """Return why two maps with these shared points cannot be of one place, or None.
 
-    chi2: rise of the joint cost by the shared points; for maps that agree χ² with 2 degrees of
-    freedom per point less 3. confidence: quantile above which the maps disagree.
+    chi2: rise of the joint cost, with 2 degrees of freedom per point less 3. confidence: quantile
+    above which the maps disagree.
     """
     limit = chi2_limit(2 * sum(shared) - 3, 1.0 - confidence)
     if chi2 > limit:

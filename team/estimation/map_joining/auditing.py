@@ -1,11 +1,9 @@
-"""Fold a tick, cut streams at its seams, and undo a closure that later submaps contradict.
+"""Fold a tick, cut streams at seams, and undo closures that later submaps contradict.
 
-After a cut (`continuity`) the tick is folded again with the later part as an island.
-
-For some ticks after a closure or a merge, the matched share of the landmarks that both sides
-observed near it is computed again. Below the bound of the settings, these ticks are folded again
-without the closure. The fold has the one before each closure, so the outcome depends on the set of
-submaps alone.
+After a cut (`continuity`) the tick is folded again with the later part as an island. For some ticks
+after a closure or a merge, the share of the landmarks near it that both sides match is computed
+again; below the bound of the settings, these ticks are folded again from the fold before the
+closure, without it. The outcome depends on the set of submaps alone.
 """
 
 from dataclasses import replace
@@ -82,7 +80,7 @@ def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSetting
 
 
 def share_now(fold: Fold, opened: Opened) -> float | None:
-    """Compute the matched share of the landmarks near a closure that both sides observed."""
+    """Compute the matched share of the landmarks near a closure."""
     places = {fold.landmarks.identity(one) for one, _ in opened.pairs}
     if not places:
         return None

@@ -1,13 +1,12 @@
 """Seams: places where a robot's view changes at once although its odometry measures no motion.
 
-Where a robot was carried off, or its odometry slips by metres, the landmarks of the scans before
-and behind a place differ. The log-likelihood ratio of a robot elsewhere against one that overlooks
-landmarks is
+Where a robot is carried off or its odometry slips by metres, the landmarks before and behind
+differ. The log-likelihood ratio of a displaced robot against one that overlooks landmarks is
 
-    ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
+  ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
 The view of a side is the sector of its landmarks, to the greatest distance of both sides. A seam
-inside a submap spoils it. Landmarks with identities: `central.diagnosis`.
+inside a submap spoils it. For landmarks with identities see `central.diagnosis`.
 """
 
 import math
@@ -23,18 +22,13 @@ from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marg
 from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.shapes import Bool, Float, Int64
 
-SCANS = 3
-"""Scans with detections of a side."""
-LEAST_SCANS = 2 * SCANS
-"""Least scans of a submap: with fewer the last ones are not beside its end."""
-LEAST_COUNT = 2
-"""Least measurements of a landmark: single ones may be clutter."""
+SCANS = 3  # scans with detections of a side
+LEAST_SCANS = 2 * SCANS  # least scans of a submap, so that the last ones are beside its end
+LEAST_COUNT = 2  # least measurements of a landmark: single ones may be clutter
 ABSENT, PRESENT = 1.5, 2.0
 """−ln P(overlooked), and ln of P(seen) over P(another landmark is within the gate)."""
-EVIDENCE = 6.0
-"""Least evidence of a seam: four absent landmarks."""
-LEAST_BEFORE = 2
-"""Least submaps of a stream or part before a seam."""
+EVIDENCE = 6.0  # least evidence of a seam: four absent landmarks
+LEAST_BEFORE = 2  # least submaps of a stream or part before a seam
 AROUND = math.pi
 """Gap between the directions of neighbouring landmarks above which a view does not close round."""
 
@@ -44,8 +38,8 @@ Indices = Int64[np.ndarray, " _"]
 class Seam(NamedTuple):
     """A place at which a stream is cut.
 
-    before, after: the last submap before it and the first one behind it; one between is spoilt.
-    begin_ns, end_ns: end of the former, beginning of the latter. evidence: log-likelihood ratio.
+    before, after: last submap before and first behind it; one between is spoilt. begin_ns, end_ns:
+    end of the former, beginning of the latter. evidence: log-likelihood ratio.
     """
 
     stream: Stream
@@ -61,8 +55,7 @@ def find_seam(
 ) -> Seam | None:
     """Find a seam of at least this evidence before a submap of a stream, or inside it.
 
-    None with fewer than LEAST_BEFORE submaps before it: a sensor whose views often change at once
-    shows no seams.
+    Returns None with fewer than LEAST_BEFORE submaps before it.
     """
     if sequence - first_of(stream) < LEAST_BEFORE:
         return None
@@ -90,7 +83,7 @@ def find_seam(
 
 
 def _compare_inside(island: Island, submap: Joined) -> float:
-    """Return the most evidence at a scan SCANS or more from the submap's ends."""
+    """Return the greatest evidence at a scan SCANS or more from the submap's ends."""
     scans = _count_scans(submap)
     found = [0.0]
     for k in range(SCANS, scans - SCANS + 1):
@@ -131,7 +124,7 @@ def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2
 def _compare_sides(
     island: Island, before: _Side, after: _Side, place: Float[np.ndarray, "2"]
 ) -> float:
-    """Compute the evidence between two sides; none with two common landmarks."""
+    """Compute the evidence between two sides; 0 with two or more common landmarks."""
     one, two = before.beside, after.beside
     if not len(one) or not len(two) or len(np.intersect1d(before.all, after.all)) > 1:
         return 0.0

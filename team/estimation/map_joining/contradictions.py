@@ -1,5 +1,4 @@
-"""Find the landmarks, or the whole factor, at fault where a robot's prior and submaps contradict
-each other.
+"""Find the landmarks, or the whole submap, that contradict a robot's prior.
 
 The prior and the submaps are the graph of one stream, solved with the centre's robust losses.
 """
@@ -22,21 +21,20 @@ from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_s
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool
 
-STREAM = ("self", 0)
-"""The stream of the prior and of the submaps."""
+STREAM = ("self", 0)  # the stream of the prior and of the submaps
 
 
 def find_beyond(
     whole: WholeMap, submaps: Sequence[LocalMap], gate: float
 ) -> list[Bool[np.ndarray, " L"]]:
-    """Find each submap's landmarks of χ² beyond the gate, which narrows on landmarks alone."""
+    """Find each submap's landmarks of χ² beyond the gate, with a robust loss on landmarks alone."""
     island = _solve(whole, submaps, JoinSettings(submap_gate=math.inf, landmark_gate=gate))
     beyond = island.graph.factors.landmark_chi2(island.state, 1.0) > gate
     return np.split(beyond, island.graph.landmark_start[1:-1])[1:]
 
 
 def join_robustly(whole: WholeMap, submaps: Sequence[LocalMap], gate: float) -> WholeMap:
-    """Join the submaps with Cauchy's loss on each as a whole, and on the map."""
+    """Join the submaps with Cauchy's loss on the prior and on each submap as a whole."""
     island = _solve(whole, submaps, JoinSettings(submap_gate=0.5, landmark_gate=gate))
     graph = island.graph
     ids = sorted(graph.landmarks)

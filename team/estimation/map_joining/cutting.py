@@ -1,6 +1,6 @@
-"""Parts of streams that are cut at seams (`continuity`), each a stream of its own in the fold.
+"""Parts of streams cut at seams (`continuity`), each a stream of its own in the fold.
 
-The later part has no initial pose; the submap inside which the robot was carried off is refused.
+The later part has no initial pose; a submap inside which the robot was carried off is refused.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ def cut_tick(tick: Tick, cuts: Sequence[Seam]) -> Tick:
 
 
 def cut_members(members: Sequence[Member], cuts: Sequence[Seam]) -> list[Member]:
-    """Assign submaps, or their inter-robot measurements, to the parts of cut streams."""
+    """Assign submaps or inter-robot measurements to the parts of cut streams."""
     parts = [find_part(each.stream, each.sequence, cuts) for each in members]
     return [
         each if part == each.stream else replace(each, incarnation=part[1])
@@ -42,7 +42,7 @@ def cut_members(members: Sequence[Member], cuts: Sequence[Seam]) -> list[Member]
 
 
 def find_part(stream: Stream, sequence: int, cuts: Sequence[Seam]) -> Stream:
-    """Find the part of a stream that has this submap."""
+    """Find the part of a stream that contains a submap."""
     for cut in cuts:
         if cut.stream == stream and sequence >= cut.after:
             stream = part_of(stream, cut.after)

@@ -1,18 +1,19 @@
-"""Landmarks that a final map leaves out: placed by an uncertain heading, missed by most submaps
-that look there, or in a repeated part of the map; lost streams, and those that odometry alone ties.
+"""Landmarks that a final map leaves out, and streams that are lost or tied by odometry alone.
 
-A robot that is carried off, or whose odometry slips by metres, maps landmarks a second time without
-a contradiction: only odometry connects its later submaps with the rest. For each boundary between
-submaps beyond which a stream observes hardly any landmark of the rest, the landmarks first observed
-beyond it are aligned with all others by a rigid motion (`voting`). With n of them, N others in an
-area A, and points that match within r, the expected number of motions that match m or more by
-chance is
+Left out are landmarks placed by an uncertain heading, missed by most submaps that look there, or in
+a repeated part of the map.
 
-    E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
+A robot that is carried off, or whose odometry slips by metres, maps landmarks twice without a
+contradiction, since only odometry connects its later submaps with the rest. For each boundary
+between submaps beyond which a stream observes hardly any landmark of the rest, the n landmarks
+first observed beyond it are aligned with the N others, in an area A, by a rigid motion (`voting`).
+The expected number of motions that match m or more within r by chance is
 
-since each pair on a pair defines one motion. In wide gates chance explains any number of matches:
-of radii from `same` down to the default profile's, the one with the least E is taken, and E is
-multiplied by their number. The building may also repeat itself: the set does not tell.
+  E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
+
+since each pair on a pair defines one motion. Of the radii from `same` down to the default
+profile's, the one of least E is used, and E is multiplied by their number. A building that repeats
+itself gives the same result.
 """
 
 import math
@@ -40,9 +41,9 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 
 def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
-    """Find the landmarks that only submaps of an uncertain heading have, ascending.
+    """Find the landmarks that only submaps of an uncertain heading observe, ascending.
 
-    A point at distance d turned by θ moves by d (1 − cos θ) in a direction that the linearised
+    A turn by θ moves a point at distance d by d (1 − cos θ) in a direction that the linearised
     covariance takes as certain: d/3 at `alignment_heading_sigma` and three standard deviations.
     """
     best: dict[int, float] = {}
@@ -55,20 +56,17 @@ def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
 
 
 WELL_OBSERVED = 4
-"""Least submaps of a landmark whose residuals show how far right associations are off."""
-LEAST_RESIDUALS = 30
-"""Least number of these residuals from which their scale is learnt."""
-LEAST_SCALE = 0.1
-"""Least scale of residuals: data without noise have none."""
+"""Least submaps of a landmark whose residuals count in the scale of right associations."""
+LEAST_RESIDUALS = 30  # least number of these residuals for an estimate of the scale
+LEAST_SCALE = 0.1  # least scale of residuals: data without noise have none
 
 
 def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
-    """Find the unnamed landmarks of which fewer than `least` submaps agree with the rest,
-    ascending; none of a saved map or that an operator has judged.
+    """Find the unnamed landmarks with which fewer than `least` submaps agree, ascending.
 
-    A submap agrees if its χ² is within `landmark_gate`, times the scale of the map's residuals
-    where that is below 1: their median over that of χ² with two degrees of freedom, 2 ln 2. A
-    stated covariance that is too large otherwise lets a neighbour pass for the landmark.
+    A submap agrees if its χ² is within `landmark_gate` times min(1, median of the map's χ² / (2 ln
+    2)), the latter its expected median: a stated covariance that is too large must not admit a
+    neighbour. Landmarks of a saved map or judged by an operator are left out.
     """
     island = fold.main
     graph, settings = island.graph, island.settings
@@ -90,12 +88,12 @@ def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
 
 
 def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
-    """Find the landmarks of the main island that nearly all submaps miss which look at their place,
-    ascending; none that an operator has judged. A saved map looks at no place.
+    """Find the landmarks of the main island that nearly all submaps with a view of them miss,
+    ascending.
 
-    A landmark of n < MOST submaps is missed where each landmark of MOST or more beside it has been
-    observed by MOST n, and at least half of its submaps have one beside it. The share of submaps
-    that find a false landmark does not grow with their number.
+    A landmark of n < MOST submaps is missed if each landmark of MOST or more submaps beside it was
+    observed by MOST n, and at least half of its submaps have one beside it. Saved maps do not
+    count; landmarks judged by an operator are left out.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)
@@ -122,8 +120,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
 
 
 def find_lost_streams(island: Island) -> dict[Stream, float]:
-    """Find the streams with a heading standard deviation above `alignment_heading_sigma`, and the
-    largest [rad].
+    """Find the streams with a heading deviation above `alignment_heading_sigma`; return the largest
+    [rad].
     """
     worst = {
         stream: max(heading_sigma(island, node) for node in nodes)
@@ -134,7 +132,7 @@ def find_lost_streams(island: Island) -> dict[Stream, float]:
 
 
 def find_parts(island: Island) -> dict[int, int]:
-    """Label the landmarks by the part of the island that common landmarks tie."""
+    """Label the landmarks by the part of the island that common landmarks connect."""
     node_of = island.graph.landmarks
     part = np.arange(len(node_of))
     for sees in _tabulate(island, [*node_of.values()]):
@@ -143,15 +141,14 @@ def find_parts(island: Island) -> dict[int, int]:
     return dict(zip(node_of, part.tolist(), strict=True))
 
 
-LEAST_TIED = 2
-"""Least number of landmarks on either side of a place that odometry alone ties."""
+LEAST_TIED = 2  # least number of landmarks on either side of a place that odometry alone ties
 
 
 class OdometryTie(NamedTuple):
-    """A place in a stream: no landmark is both before it, or in other streams, and behind it.
+    """A place in a stream that no landmark spans: none is both behind it and elsewhere.
 
     first: submap behind it. earlier, later: numbers of landmarks. begin_ns, end_ns: of the part
-    behind it. sigmas: standard deviation of its start's position [m] and heading [rad].
+    behind it. sigmas: of its start's position [m] and heading [rad].
     """
 
     stream: Stream
@@ -166,10 +163,11 @@ class OdometryTie(NamedTuple):
 def find_odometry_ties(
     island: Island, shown: Collection[int], undecided: Collection[int] = ()
 ) -> list[OdometryTie]:
-    """Find the place of each stream, with a shown landmark on both sides, that its misses of
-    landmarks speak against most, and at least as much as one beyond doubt (`late_seams`).
+    """Find each stream's odometry tie with the most evidence of missed landmarks, at least
+    MOST_ABSENT.
 
-    Without such misses the odometry there is as right as its covariance states.
+    A shown landmark is on both sides. The evidence is that of `late_seams`; without it the
+    covariance of the odometry there is valid.
     """
     unnamed = sorted(node for id_, node in island.graph.landmarks.items() if id_ >= UNNAMED)
     sees = _tabulate(island, unnamed)
@@ -213,7 +211,7 @@ def find_odometry_ties(
 
 
 def _tabulate(island: Island, nodes: Collection[int]) -> Bool[np.ndarray, "K n"]:
-    """Tabulate which submaps observe which of these landmarks."""
+    """Tabulate which submaps observe which landmarks."""
     at = np.full(len(island.graph.fixed), -1, np.int64)
     at[[*nodes]] = np.arange(len(nodes))
     sees = np.zeros((len(island.graph.submaps), len(nodes)), np.bool_)
@@ -223,28 +221,21 @@ def _tabulate(island: Island, nodes: Collection[int]) -> Bool[np.ndarray, "K n"]
     return sees
 
 
-LEAST_PAIRS = 6
-"""Least number of landmarks that repeat others."""
-LEAST_SHARE = 0.5
-"""Least share of the landmarks beyond the boundary that repeat others."""
-MOST_SHARED = 0.25
-"""Largest share of these submaps' landmarks that the rest has, too."""
-BY_CHANCE = -14.0
-"""Largest ln E: one in a million."""
-FARTHER = 4.0
-"""Least distance of the two places, in radii."""
-MOST_POINTS = 400
-"""Larger maps are not searched: voting would take seconds."""
-TRIED = 4
-"""Most boundaries of a stream that are examined, by least shared part."""
+LEAST_PAIRS = 6  # least number of landmarks that repeat others
+LEAST_SHARE = 0.5  # least share of the landmarks beyond the boundary that repeat others
+MOST_SHARED = 0.25  # largest share of these submaps' landmarks that the rest has, too
+BY_CHANCE = -14.0  # largest ln E: one in a million
+FARTHER = 4.0  # least distance of the two places, in radii
+MOST_POINTS = 400  # larger maps are not searched: voting would take seconds
+TRIED = 4  # most boundaries of a stream that are examined, by least shared part
 
 
 class Repetition(NamedTuple):
     """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
 
-    ids: landmarks that only these submaps have; pairs: those that match. begin_ns, end_ns: of these
-    submaps. place: at the boundary (x, y) [m]; displacement: its move (x, y) [m] and turn [rad] if
-    each pair were one landmark.
+    ids: landmarks of these submaps alone; pairs: those that match. begin_ns, end_ns: of these
+    submaps. place: of the boundary (x, y) [m]; displacement: its move (x, y) [m] and turn [rad]
+    that would make each pair one landmark.
     """
 
     stream: Stream
@@ -258,7 +249,7 @@ class Repetition(NamedTuple):
 
 
 def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
-    """Find the repetitions among landmarks of an island, at most one of each stream."""
+    """Find at most one repetition of each stream."""
     unnamed = sorted(id_ for id_ in ids if id_ >= UNNAMED)
     if not 2 * LEAST_PAIRS <= len(unnamed) <= MOST_POINTS:
         return []
@@ -326,9 +317,7 @@ def _find_in_stream(
 def _align_beyond_chance(
     own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
 ) -> tuple[Vote, float] | None:
-    """Align the points with others at the radius whose matches chance explains least; return the
-    alignment and the radius [m].
-    """
+    """Align the points with others at the radius [m] of least E; return both."""
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
@@ -348,7 +337,6 @@ def _align_beyond_chance(
 
 
 def _list_radii(same: float) -> list[float]:
-    """List `same` and its halves down to that of the default profile."""
     radii = [same]
     while radii[-1] > DEFAULT_PROFILE.same:
         radii.append(max(0.5 * radii[-1], DEFAULT_PROFILE.same))

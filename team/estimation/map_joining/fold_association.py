@@ -1,6 +1,4 @@
-"""Data association (`team.estimation.association`) applied to the fold: merges landmarks, closures
-and islands. Each step is a function of the fold alone.
-"""
+"""Apply data association (`team.estimation.association`) to the fold: merges, closures, islands."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -47,11 +45,11 @@ from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
 
 AMBIGUITY_GROWTH = 1.25
-"""Growth of the number of submaps of two islands after which an ambiguous attempt is repeated."""
+"""Growth in submaps of two islands after which an ambiguous attempt is repeated."""
 
 
 def associate_tick(fold: Fold, contributions: Sequence[Contribution]) -> Fold:
-    """Associate the landmarks of a tick's submaps where some are unnamed."""
+    """Associate the unnamed landmarks of a tick's submaps."""
     fold = replace(fold, landmarks=replace(fold.landmarks, opened=()))
     arrived: dict[Stream, list[Contribution]] = {}
     for contribution in contributions:
@@ -93,7 +91,7 @@ def view_island(island: Island, landmarks: Landmarks) -> IslandView:
 
 
 class _IslandViews:
-    """The views of the islands, computed once while an island does not change."""
+    """Views of the islands, cached while an island does not change."""
 
     def __init__(self) -> None:
         self._of: dict[Stream, tuple[Island, IslandView]] = {}
@@ -193,7 +191,7 @@ def _decide(
     kind: str,
     sides: tuple[Stream, Stream],
 ) -> Decision:
-    """Decide on a closure; one that failed, or was undone before, "waits"."""
+    """Decide on a closure; one that failed or was undone before "waits"."""
     why = found.why
     if not why and fold.landmarks.was_undone(pairs):
         why = "it was undone before"
@@ -221,7 +219,7 @@ def _record(
 ) -> Fold:
     """Record a deferred decision; open an accepted one for audit.
 
-    Pairs are recorded by their smallest members, without those of named landmarks.
+    Pairs are recorded by their smallest members, without named landmarks.
     """
     waits = fold.landmarks.waits
     if decision.why:
@@ -254,8 +252,8 @@ def _merge_islands(
     second_from_first: Float[np.ndarray, "3"],
     decision: Decision,
 ) -> Fold:
-    """Merge two islands in the frame of the first by `precedence`, and search the moved streams for
-    closures; unchanged without a solution.
+    """Merge two islands in the frame of the first by `precedence` and search the moved streams for
+    closures; return the fold unchanged without a solution.
     """
     landmarks, becomes = merge_sets(fold.landmarks, ties)
     renamed = {}

@@ -1,17 +1,16 @@
 """Diagnosis: the causes of a misfit, each with its evidence, the best one first.
 
-A hypothesis adds unknowns θ to the graph: a landmark has a second place, a robot jumps between two
-submaps. Its evidence is the cost that they remove,
+A hypothesis adds unknowns θ to the graph: a second place of a landmark, a jump of a robot between
+two submaps. Its evidence is the cost that they remove,
 
-    e = min_x cost(x) − min_{x, θ} cost(x, θ),
+  e = min_x cost(x) − min_{x, θ} cost(x, θ),
 
-χ² with dim θ degrees of freedom where nothing is wrong; both minima have the robust loss. A scan of
-single submaps proposes hypotheses, which are solved at the final robust scales. The best one by
-evidence per degree of freedom stays in the graph while the others are tested again.
+χ² with dim θ degrees of freedom without a fault; both minima have the robust loss. A scan of single
+submaps proposes hypotheses, which are solved at the final robust scales. The best by evidence per
+degree of freedom stays in the graph while the others are tested again.
 
-Since real data have errors beyond the model, the evidence is divided by the covariance scale of the
-other submaps (an F test but for the scatter of the scale), and an effect must be larger than a
-single submap resolves.
+Because real data have errors beyond the model, the evidence is divided by the covariance scale of
+the other submaps, and an effect must exceed the resolution of a single submap.
 """
 
 import math
@@ -44,49 +43,35 @@ Costs = Float[np.ndarray, "..."]
 Places = Int64[np.ndarray, " n"]
 Covariance = Float[np.ndarray, "k k"]
 
-CHANCE = 1e-3
-"""Probability that chance alone gives a hypothesis of any landmark or seam enough evidence."""
+CHANCE = 1e-3  # probability that chance gives a hypothesis of any landmark or seam enough evidence
 SplitCause = Literal["landmark_moved", "identity_shared", "carried_off"]
 MOVED: Final = "landmark_moved"
 SHARED: Final = "identity_shared"
 CARRIED_OFF: Final = "carried_off"
-LEAST_SPOILT = 3
-"""Least number of submaps that one identity of two landmarks spoils."""
-SPOILT = 0.6
-"""Least share of them among the submaps that have a landmark elsewhere."""
-FAR = 50.0
-"""Most χ² of an observation in a scan: a wild one must not decide it."""
+LEAST_SPOILT = 3  # least number of submaps spoilt by one identity of two landmarks
+SPOILT = 0.6  # least share of them among the submaps that have a landmark elsewhere
+FAR = 50.0  # bound of an observation's χ² in a scan, so that an outlier does not decide it
 STRAY = 0.1
-"""Least share of a landmark's observations at a second place, unless they agree with each other:
-of markers that are misread easily up to 6 of 177 submaps are elsewhere, scattered (UTIAS set 2,
-landmark 15, whose place is right to 2 mm).
+"""Least share of a landmark's observations at a second place, unless they agree with each other: of
+easily misread markers up to 6 of 177 submaps are elsewhere, scattered (UTIAS set 2, landmark 15).
 """
-ITERATIONS = 8
-"""Most rounds of the search for two places."""
-SIGMAS = 4.0
-"""Least size of an effect in its standard deviations."""
+ITERATIONS = 8  # most rounds of the search for two places
+SIGMAS = 4.0  # least size of an effect in its standard deviations
 JUMP_SIGMAS = 8.0
-"""Least size of a jump of a robot: a submap with misread landmarks shows a jump of 4 to 6."""
-RESOLVED = 1.5
-"""Least size of an effect in standard deviations of one submap."""
-AT_ONCE = 32
-"""Number of places about which a scan evaluates the observations at once."""
-POSE = 3
-"""Degrees of freedom of a jump."""
-LEAST_SIDE = 2
-"""Least number of submaps on each side of a split."""
-PROPOSED = 3
-"""Most hypotheses of a kind that are solved in a round, by their evidence in the scan."""
-ROUNDS = 6
-"""Most causes that are accepted."""
+"""Least size of a robot's jump: a submap with misread landmarks shows one of 4 to 6."""
+RESOLVED = 1.5  # least size of an effect in standard deviations of one submap
+AT_ONCE = 32  # number of places that a scan evaluates at once
+POSE = 3  # degrees of freedom of a jump
+LEAST_SIDE = 2  # least number of submaps on each side of a split
+PROPOSED = 3  # most hypotheses of a kind solved in a round, by their evidence in the scan
+ROUNDS = 6  # most causes that are accepted
 
 
-ALL = slice(None)
-"""Every observation."""
+ALL = slice(None)  # every observation
 
 
 class Sights(NamedTuple):
-    """Observations of one landmark by time: the submap's place in the graph, position [m] and
+    """Observations of one landmark by time: submap's place in the graph, position [m] and
     covariance (xx, xy, yy) [m²].
     """
 
@@ -99,8 +84,8 @@ class Sights(NamedTuple):
 class Hypothesis(NamedTuple):
     """A cause: the solved graph, the cost that it removes, and its degrees of freedom.
 
-    robots: those that observe the less frequent place, or jump. at_ns: of a jump at a stream's
-    start 0: its initial pose is wrong by `value`.
+    robots: those that observe the less frequent place, or jump. at_ns: of a jump; 0 at a stream's
+    start, whose initial pose is wrong by `value`.
     """
 
     cause: SplitCause
@@ -115,9 +100,7 @@ class Hypothesis(NamedTuple):
 
 
 def sights_of(island: Island, beyond: float = -math.inf) -> dict[int, Sights]:
-    """Tabulate the observations of each named landmark whose χ² about one place is
-    above a bound.
-    """
+    """Tabulate the observations of each named landmark whose χ² about one place exceeds a bound."""
     graph, nodes = island.graph, island.graph.landmark_nodes
     points, spread = island.estimate.observations
     scatter = core.scatter_of_landmarks(points, spread, nodes, len(graph.fixed), FAR)
@@ -146,7 +129,7 @@ class _Two(NamedTuple):
 def _chi2_about(
     sights: Sights, point: Float[np.ndarray, "*k 2"], own: slice | Bool[np.ndarray, " n"] = ALL
 ) -> Costs:
-    """Evaluate the χ² of observations about a place, or about k places (k × 1 × 2)."""
+    """Evaluate the χ² of observations about one place, or about k places (k × 1 × 2)."""
     return _chi2_of(sights.points[own] - point, sights.spread[own])
 
 
@@ -163,20 +146,20 @@ def _centre(sights: Sights, own: Bool[np.ndarray, " n"]) -> Values:
 
 
 def median(values: Float[np.ndarray, "..."]) -> Values:
-    """Median over the first axis; for a few values faster than `numpy.median`."""
+    """Compute the median over the first axis; faster than `numpy.median` for a few values."""
     ordered, n = np.sort(values, axis=0), len(values)
     middle: Values = 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2])
     return middle
 
 
 def _least_side(n: int) -> int:
-    """Fewest of n observations at a place: fewer may be misread."""
+    """Return the fewest of n observations at a place; fewer may be misread."""
     return max(LEAST_SIDE, math.ceil(STRAY * n))
 
 
 def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
-    """Whether both places have enough observations: a share of STRAY, or two that agree and are
-    most of those elsewhere. Misread ones are scattered.
+    """Return whether both places have enough observations: a share of STRAY, or two that agree and
+    are most of those elsewhere.
     """
     few = _less_frequent(second)
     count = int(few.sum())
@@ -194,10 +177,7 @@ def _less_frequent(second: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
 
 
 def _price(second: Bool[np.ndarray, " n"]) -> float:
-    """χ² of the choice of k of n: 2 log((n + 1) n!/(k! (n − k)!)).
-
-    Every k is equally likely beforehand, and so is every choice with one k.
-    """
+    """χ² of the choice of k of n: 2 log((n + 1) n!/(k! (n − k)!)), every k equally likely."""
     n, k = len(second), int(second.sum())
     ratios = np.arange(n - k + 1.0, n + 1.0) / np.arange(1.0, k + 1.0)
     return 2.0 * float(core.log(n + 1.0) + core.log(ratios).sum())
@@ -221,9 +201,9 @@ def change_of(sights: Sights) -> _Two | None:
 
 
 def clusters_of(sights: Sights, scale: float, enough: float) -> _Two | None:
-    """Find two places among a landmark's observations, whatever their order.
+    """Find two places among a landmark's observations, in any order.
 
-    scale: the covariance scale, by which chance removes more χ².
+    scale: the covariance scale, which multiplies the price.
     """
     n = len(sights.places)
     one = _chi2_about(sights, median(sights.points))
@@ -254,7 +234,7 @@ class _Solved:
 
     @cached_property
     def cost(self) -> float:
-        """Its cost at final robust scales."""
+        """Cost at the final robust scales."""
         return final_cost(self.island)
 
 
@@ -272,7 +252,7 @@ def _difference(island: Island, before: int, after: int) -> tuple[Values, Covari
 
 
 def _begin_ns(island: Island, place: int) -> int:
-    """Return the end of the preceding submap of the stream; 0 for the first."""
+    """Return the end of the stream's preceding submap; 0 for the first."""
     own = island.graph.submaps[place].contribution
     ends = (
         each.contribution.end_ns
@@ -345,8 +325,8 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the hypotheses of a jump beside a submap that disagrees with the rest.
 
-    A jump removes no more cost than leaving out the submap, which is solved first. Before a first
-    submap it is an error of the initial pose.
+    Leaving out the submap is solved first, since a jump removes no more cost. A jump before a first
+    submap is an error of the initial pose.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
@@ -395,7 +375,7 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 
 
 def _is_known_start(graph: Graph, place: int) -> bool:
-    """Whether a robot's submap begins at an initial pose, exact or with a covariance."""
+    """Return whether a robot's submap begins at an initial pose, exact or with a covariance."""
     start = int(graph.submaps[place].nodes[0])
     if is_map(graph.submaps[place].contribution.stream):
         return False
@@ -405,7 +385,7 @@ def _is_known_start(graph: Graph, place: int) -> bool:
 def _motion_beyond(
     island: Island, start: int, end: int, own: LocalMap
 ) -> tuple[Values, Covariance]:
-    """Return the motion between poses minus a submap's own, in the map's frame."""
+    """Return the motion between two poses less the submap's own, in the map's frame."""
     mean, P = joint_marginal(island, [start, end])
     predicted = compose(mean[:3], own.end_pose)
     s, c = core.sin_and_cos(float(mean[2]))
@@ -423,8 +403,7 @@ def _motion_beyond(
 def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     """Propose that one number of two landmarks spoils submaps that observed both.
 
-    Most of them have the same landmark worst, between the two, and a bent path. The second place
-    has two numbers in each.
+    Most of these submaps have that landmark worst, between its two places, and a bent path.
     """
     island, graph = base.island, base.island.graph
     chi2 = graph.factors.landmark_chi2(island.state, island.settings.covariance_factor)
@@ -467,7 +446,7 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
 
 
 def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
-    """Whether the evidence is beyond chance, and the effect beyond its scatter."""
+    """Return whether the evidence exceeds chance and the effect its scatter."""
     sizes = [(math.hypot(*each.value[:2]), max(each.sigma[:2]))]
     sizes += [
         (abs(turn), sigma) for turn, sigma in zip(each.value[2:], each.sigma[2:], strict=True)
@@ -478,9 +457,7 @@ def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
 
 
 def explain(island: Island) -> tuple[list[Hypothesis], Island]:
-    """Find landmarks with two places and robots that were carried off, and the island with these
-    unknowns.
-    """
+    """Find landmarks with two places and robots carried off, and the island with these unknowns."""
     base = _solved(robust(island))
     graph = base.island.graph
     tests = 2 * len(graph.submaps) + len(graph.landmark_nodes)
@@ -504,9 +481,9 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
 def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list[Hypothesis]:
     """Drop repetitions, and the apparent effects of another fault.
 
-    One number of two landmarks bends paths, which is no jump. A robot at several places was not
-    carried off unless a submap before or after each agrees with the map: its measurements were
-    wild, as is a second place that it alone observes.
+    One number of two landmarks bends paths, which is no jump. A robot with jumps at several places
+    and no sound submap beside one of them has wild measurements, as has a second place that it
+    alone observes.
     """
     jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
     wild = {
@@ -526,7 +503,7 @@ def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list
 
 
 def _is_beside_sound(jump: Hypothesis, base: _Solved, level: float) -> bool:
-    """Whether a submap beside a jump agrees with the map; the other may have a scan beyond it."""
+    """Return whether a submap beside a jump agrees with the map."""
     island = base.island
     costs = terms(island).submaps
     is_sound = (costs.chi2 <= base.scale * (costs.dof + level)).tolist()

@@ -1,16 +1,15 @@
-"""Seams that later submaps show: landmarks that one side of a place should have observed.
+"""Seams shown by later submaps: landmarks that one side of a place should have observed.
 
 Among few landmarks a robot that is carried off loses sight of nothing at once (`continuity`). Later
-it misses the landmarks of places that it passes, and maps others where nothing was observed. The
-log-likelihood ratio of a stream elsewhere from a submap on, against one at its place, is
+it misses the landmarks of places that it passes and maps others. The log-likelihood ratio of a
+stream elsewhere from a submap on, against one at its place, is
 
-    Σ min(Σ_s −ln(1 − p(d_ls)), −ln LEAST_OVERLOOKED) − PRESENT · (landmarks of both sides)
+  Σ min(Σ_s −ln(1 − p(d_ls)), −ln LEAST_OVERLOOKED) − PRESENT · (landmarks of both sides)
 
-over the landmarks l that one side has and the submaps s of the other side, unless another landmark
-of that side is within the gate. p(d) is the probability that a submap of the robot observes a
-landmark at distance d, learnt from all its submaps and all landmarks: also a camera that looks one
-way, or walls, make it small, and so do the landmarks that it misses behind a seam. It is averaged
-over the uncertainty of d.
+over the landmarks l of one side and the submaps s of the other, unless another landmark of that
+side is within the gate. p(d) is the probability that a submap of the robot observes a landmark at
+distance d, estimated from all its submaps and all landmarks, so that a narrow field of view or
+walls make it small. It is averaged over the uncertainty of d.
 """
 
 import math
@@ -32,19 +31,15 @@ from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.shapes import Bool, Float, Int64
 
 MOST_ABSENT = -core.log(LEAST_OVERLOOKED)
-"""Most evidence of one landmark: some are visible from one side only."""
-LATE_EVIDENCE = 3.0 * MOST_ABSENT
-"""Least evidence of a seam: three landmarks that are missed beyond doubt."""
-AMBIGUOUS = 1.0
-"""Evidence by which neighbouring seams are not told apart."""
-LEAST_COUNT = 4
-"""Least measurements of a landmark: fewer may be clutter."""
-MOST_TRACKED = 1
-"""Most landmarks that a robot observes on both sides of a seam, by chance."""
+"""Most evidence of one landmark, which may be visible from one side only."""
+LATE_EVIDENCE = 3.0 * MOST_ABSENT  # least evidence of a seam: three landmarks missed beyond doubt
+AMBIGUOUS = 1.0  # difference of evidence below which neighbouring seams are one
+LEAST_COUNT = 4  # least measurements of a landmark: fewer may be clutter
+MOST_TRACKED = 1  # most landmarks that a robot observes on both sides of a seam, by chance
 MOST_COMMON = 2
 """Most landmarks on both sides of a seam, by chance: three place a stream. More of those behind it
-are new, and either side misses one of the other's beyond doubt: a camera that looks one way misses
-many, but maps none a second time.
+must be new and each side must miss one beyond doubt, since a narrow camera misses many but maps
+none twice.
 """
 NODES = ((0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0), (-math.sqrt(3.0), 1.0 / 6.0))
 """Nodes and weights of the Gauss-Hermite rule of three points."""
@@ -53,9 +48,7 @@ Misses = Float[np.ndarray, "K n"]
 
 
 class _Place(NamedTuple):
-    """A candidate: rows of the last submap before a seam and the first one behind it, in a stream;
-    evidence.
-    """
+    """A candidate: rows of the submaps before and behind a seam in a stream, and its evidence."""
 
     before: int
     after: int
@@ -64,7 +57,7 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Sights:
-    """Which of K submaps observed which of n unnamed landmarks, by node.
+    """Observations of n unnamed landmarks, by node, in K submaps.
 
     counts: measurements of each landmark. away: distance [m] of each from each submap's path.
     """
@@ -139,7 +132,7 @@ def _rows_of(sights: _Sights, stream: Stream) -> list[int]:
 
 
 def _misses(sights: _Sights, spread: Float[np.ndarray, "K n"]) -> Misses:
-    """Compute −ln P(a submap misses a landmark); spread: standard deviation [m] of its distance."""
+    """Compute −ln P(a submap misses a landmark); spread: deviation [m] of the distances."""
     out = np.zeros(sights.away.shape)
     robots = np.array([each.contribution.robot for each in sights.submaps])
     stable = sights.counts >= LEAST_COUNT
@@ -157,8 +150,8 @@ def _misses(sights: _Sights, spread: Float[np.ndarray, "K n"]) -> Misses:
 def _uncertainty_of(
     island: Island, sights: _Sights
 ) -> tuple[Float[np.ndarray, "K n"], Bool[np.ndarray, "n n"]]:
-    """Compute the standard deviation of the landmarks' distances from the submaps' nearer ends, and
-    which landmarks may be one.
+    """Compute the standard deviation of the distances of landmarks from the submaps' nearer ends,
+    and which landmarks may be one.
     """
     graph, points, n = island.graph, sights.points, len(sights.nodes)
     ends = np.array([each.nodes[:2] for each in sights.submaps])
@@ -192,9 +185,7 @@ def _uncertainty_of(
 def _best_place(
     sights: _Sights, stream: Stream, misses: Misses, possible: Bool[np.ndarray, "n n"]
 ) -> list[_Place]:
-    """Find the candidate of a stream with the most evidence, and its neighbours that are not told
-    apart from it.
-    """
+    """Find the candidate of most evidence in a stream, with neighbours within AMBIGUOUS."""
     rows = _rows_of(sights, stream)
     places = list(_list_places(sights, rows, misses, possible))
     if not places:
@@ -212,7 +203,7 @@ def _best_place(
 def _list_places(
     sights: _Sights, rows: list[int], misses: Misses, possible: Bool[np.ndarray, "n n"]
 ) -> Iterator[_Place]:
-    """List the candidates of a stream in the order of time: between two submaps, or inside one."""
+    """List the candidates of a stream by time: between two submaps, or inside one."""
     for k in range(LEAST_BEFORE, len(rows)):
         before, row = rows[k - 1], rows[k]
         for after in (k, k + 1):
@@ -231,9 +222,7 @@ def _list_places(
 
 
 def weigh_places(island: Island, places: Sequence[tuple[Stream, int]]) -> list[float]:
-    """Compute the evidence of a stream elsewhere from a submap on, for places (stream, sequence)
-    with no landmark on both sides.
-    """
+    """Compute the evidence for places (stream, sequence) that no landmark spans."""
     if not places:
         return []
     sights = _sights_of(island)
@@ -254,8 +243,8 @@ def _weigh_place(
     misses: Misses,
     possible: Bool[np.ndarray, "n n"],
 ) -> tuple[list[float], int, int]:
-    """Compute the evidence of each side of a place (k, after), the number of landmarks of both, and
-    of those that only the stream's submaps `rows[after:]` have; rows[k:after] is on no side.
+    """Return the evidence of each side of a place (k, after), the number of common landmarks, and
+    of those of the submaps `rows[after:]` alone; rows[k:after] is on neither side.
     """
     stable = sights.counts >= LEAST_COUNT
     behind = np.zeros(len(sights.submaps), np.bool_)
@@ -274,7 +263,7 @@ def _weigh_place(
 
 
 def _least_tracked(submap: Joined) -> int:
-    """Return the least number of landmarks that are observed on both sides of a scan."""
+    """Return the least number of landmarks observed on both sides of a scan."""
     seen = submap.contribution.local.unnamed.seen
     before = np.logical_or.accumulate(seen, axis=1)[:, :-1]
     after = np.logical_or.accumulate(seen[:, ::-1], axis=1)[:, ::-1][:, 1:]

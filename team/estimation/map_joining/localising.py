@@ -1,7 +1,7 @@
 """Place a robot without a start in the team's map, by shared landmarks.
 
-The robot's own map, a Gaussian over its pose p and its landmarks, is one submap. The alignment of
-the shared landmarks gives its start, least squares over the team's landmarks and this submap the
+The robot's own map, a Gaussian over its pose and landmarks, is one submap. The alignment of the
+shared landmarks gives its start; least squares over the team's landmarks and this submap give the
 pose with its covariance.
 """
 
@@ -32,13 +32,11 @@ from teamslam.team.shapes import Float, Int64, UInt32
 
 SETTINGS = JoinSettings()
 FLAT = 1e4
-"""Factor by which the covariance of the alignment is raised for the prior of the start: the
-landmarks that give it are counted in the solution.
+"""Factor on the alignment's covariance for the prior of the start, so that the landmarks do not
+count twice.
 """
 HEADING_SIGMA = 0.5
-"""Largest `Alignment.heading_sigma` [rad], more than for a merge: nothing is fused by this pose,
-which states the covariance of its arc.
-"""
+"""Largest `Alignment.heading_sigma` [rad]; above that of a merge, since the pose is not fused."""
 
 
 def locate_robot(
@@ -47,11 +45,11 @@ def locate_robot(
     window: LocalMap | None,
     covariance_factor: float = 1.0,
 ) -> Posed | str:
-    """Estimate a robot's pose in the frame of the team's landmarks, or give the reason why they do
-    not determine it.
+    """Estimate a robot's pose in the frame of the team's landmarks, or return why it is
+    undetermined.
 
-    own: the robot's map; window: the open one; covariance_factor: on both, as on all submaps. The
-    largest set of landmarks of one rigid motion is used, if it is most of them. Raises
+    own: the robot's map; window: the open one; covariance_factor: on both. If the landmarks
+    disagree, the largest set of one rigid motion is used, provided that it is most of them. Raises
     NotACovarianceError, NotDeterminedError.
     """
     whole = own if window is None else join_submap(own, window.named)
@@ -95,7 +93,7 @@ class _Shared(NamedTuple):
         in_team: Int64[np.ndarray, " n"],
         in_own: Int64[np.ndarray, " n"],
     ) -> "_Shared":
-        """Take the marginals of the landmarks at these indices."""
+        """Select the marginals of the landmarks at these indices."""
         at, of = _points(in_team), np.concatenate([np.arange(3), 3 + _points(in_own)])
         return cls(
             team.ids[in_team],
@@ -107,11 +105,11 @@ class _Shared(NamedTuple):
 
     @property
     def b(self) -> Float[np.ndarray, "n 2"]:
-        """The robot's landmarks."""
+        """Robot's landmarks [m]."""
         return self.mean[3:].reshape(-1, 2)
 
     def fit(self) -> tuple[Alignment | None, str | None]:
-        """Align the landmarks, or give the reason why they do not."""
+        """Align the landmarks; return the alignment and the reason of a refusal."""
         shared, fit = SharedPoints(len(self.ids)), None
         if len(self.ids) >= NEEDED:
             fit = align(self.a, self.A, self.b, self.P[3:, 3:])

@@ -22,7 +22,7 @@ from teamslam.team.estimation.map_joining.submap_graph import (
 
 
 def add_markers(island: Island) -> Island:
-    """Add a marker state to each unnamed landmark without one; with condensed submaps unchanged."""
+    """Add a marker state to each unnamed landmark without one, unless submaps are condensed."""
     graph, number = island.graph, _find_unmarked(island)
     if not number or graph.condensed is not None:
         return island
@@ -75,9 +75,7 @@ def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
 def _add_rows(
     submap: Joined, errors: list[int], nodes: Mapping[CommonError, int], number: dict[int, int]
 ) -> Joined:
-    """Add a row of sensitivity for each marker: that of the ranges' scale, of the
-    landmark alone.
-    """
+    """Add each marker's row of sensitivity: that of the range's scale, for the landmark alone."""
     if not errors:
         return submap
     local = submap.contribution.local

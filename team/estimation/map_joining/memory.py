@@ -1,8 +1,8 @@
-"""Observations of condensed submaps for association: landmarks seen together, viewed places.
+"""Observations of condensed submaps for association.
 
-Of each landmark the newest MOST submaps are stored whole, of older ones the pairs of landmarks that
-they kept apart. A landmark of n < MOST submaps, probably a false detection, is dropped when every
-landmark of MOST or more, last observed with it, has since been observed by MOST n submaps.
+The newest MOST submaps of each landmark are stored whole; of older ones, the pairs of landmarks
+that they kept apart. A landmark of n < MOST submaps, probably a false detection, is dropped when
+every landmark of MOST or more, last observed with it, has since been observed by MOST n submaps.
 """
 
 from collections.abc import Sequence
@@ -16,17 +16,16 @@ from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
 
-MOST = 8
-"""Newest condensed submaps stored for each landmark."""
+MOST = 8  # newest condensed submaps stored for each landmark
 
 
 NO_COUNTS: Indices = np.zeros(0, np.int64)
 
 
 class Observed(NamedTuple):
-    """A submap, and the node of each landmark; −1 for a dropped one.
+    """A submap with the node of each landmark; −1 for a dropped one.
 
-    counts: number of condensed submaps with each landmark; empty if not condensed.
+    counts: condensed submaps with each landmark; empty if not condensed.
     """
 
     observation: Observation
@@ -35,7 +34,7 @@ class Observed(NamedTuple):
 
     @property
     def known(self) -> Indices:
-        """Nodes of the landmarks but for dropped ones."""
+        """Nodes of the landmarks without dropped ones."""
         return self.landmarks[self.landmarks >= 0]
 
 
@@ -43,8 +42,8 @@ class Observed(NamedTuple):
 class Memory:
     """The stored condensed submaps, oldest first, and the pairs of forgotten ones.
 
-    pairs: nodes of two landmarks of one forgotten submap, ascending. distinct: which are known to
-    be two (`LocalMap.distinct`).
+    pairs: nodes of two landmarks of one forgotten submap, ascending. distinct: certainly two
+    (`LocalMap.distinct`).
     """
 
     submaps: tuple[Observed, ...] = ()
@@ -52,7 +51,7 @@ class Memory:
     distinct: Bool[np.ndarray, " P"] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def renumbered(self, node_of: Indices) -> "Memory":
-        """Renumber the nodes, −1 for a dropped one; landmarks that become one are no pair."""
+        """Renumber the nodes, −1 for a dropped one; drop pairs that become one landmark."""
         to = np.append(node_of, -1)
         submaps = tuple(each._replace(landmarks=to[each.landmarks]) for each in self.submaps)
         return replace(_unique(to[self.pairs], self.distinct), submaps=submaps)

@@ -3,11 +3,10 @@
 Starts are the places that the shared points propose (all, the landmarks alone, the inter-robot
 measurements alone, every heading at which they fit well), and one independent of them (`minima`).
 The full solution of lowest cost is accepted if the maps agree and no other place is about as
-likely; else the merge is deferred.
+likely; otherwise the merge is deferred.
 
-A shared point is a landmark of both, or a teammate observed from a pose node: in the observer's
-island at pose ∘ (range, bearing), in its own at its pose node. An inter-robot measurement and the
-reverse one are two points.
+A shared point is a landmark of both, or a teammate observed from a pose node: at pose ∘ (range,
+bearing) in the observer's island, at its pose node in its own.
 """
 
 import math
@@ -59,19 +58,15 @@ JointPoints = tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "m m"]]
 """n points [m] and their joint covariance, m = 2n."""
 HEADINGS = 24
 MOST_POINTS = 24
-"""Most points for which more than the best heading is tried: more points do not fit at two
-headings, and would make the search slow.
-"""
-MOST_FIXES = 60
-"""Most fixes by which islands are aligned: the work grows with the cube of their number."""
-HOPELESS = 100.0
-"""Rise of χ² above the best heading's beyond which a heading is not tried."""
+"""Most points for which more than the best heading is tried; more do not fit at two headings."""
+MOST_FIXES = 60  # most fixes that align islands: the work grows with the cube of their number
+HOPELESS = 100.0  # rise of χ² above the best heading's beyond which a heading is not tried
 
 
 class SharedPoint(NamedTuple):
-    """One point: its node in both islands, and the measurement that ties them.
+    """A point's node in both islands, and the measurement that ties them.
 
-    seen: the inter-robot measurement; None for a landmark. from_main: the observer is in the main
+    seen: inter-robot measurement; None for a landmark. from_main: the observer is in the main
     island.
     """
 
@@ -97,10 +92,10 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
 def sound_ties(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> tuple[list[SharedPoint], list[InterRobotFactor]]:
-    """Return the points by which islands are aligned, and the fixes left out.
+    """Return the points that align islands, and the fixes left out.
 
-    At most MOST_FIXES fixes, evenly spaced in time, without those that no rigid motion places with
-    most of the others.
+    At most MOST_FIXES fixes, evenly spaced in time, of which outliers of the common rigid motion
+    are removed.
     """
     every = [each for each in tied if each.seen is not None and each.seen.is_fix]
     if len(every) <= LEAST_AGREEING:
@@ -120,7 +115,7 @@ def sound_ties(
 def aligned_by(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> alignment.Alignment | None:
-    """Align the other island with the main one; None where points are too few."""
+    """Align the other island with the main one; None with too few points."""
     if len(tied) < alignment.NEEDED:
         return None
     in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
@@ -129,7 +124,7 @@ def aligned_by(
 
 
 def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None, bool]]) -> JointPoints:
-    """Positions of nodes, or of points measured from them or on them, with joint covariance.
+    """Compute positions of nodes, or of points measured from or on them, with joint covariance.
 
     at: node, measurement, and whether the node is the observer's.
     """
@@ -164,8 +159,7 @@ def headings_that_fit(
 ) -> list[Float[np.ndarray, "3"]]:
     """Find every main_from_other whose heading is a local minimum of the shared points' χ².
 
-    The best translation at each heading of a grid is closed-form. Headings worse by more than
-    HOPELESS are left out; with more than MOST_POINTS points only the best stays.
+    The best translation at each heading of a grid is closed-form.
     """
     if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
         return []
@@ -182,12 +176,11 @@ def headings_that_fit(
     ]
 
 
-WORTH_TELLING = 1.0
-"""Least gain in χ² for which a search is reported: below, it found the place of the first guess."""
+WORTH_TELLING = 1.0  # least reported gain of a search in χ²
 
 
 class Merge(NamedTuple):
-    """The merged island, the waiting inter-robot measurements, and the certainty in words."""
+    """The merged island, the waiting inter-robot measurements, and a description."""
 
     best: Minimum
     waiting: tuple[InterRobotFactor, ...]
@@ -195,7 +188,7 @@ class Merge(NamedTuple):
 
 
 class Waits(NamedTuple):
-    """Why two islands stay separate; after_search: after a (slow) search."""
+    """Reason why two islands stay separate; after_search: after a (slow) search."""
 
     why: str
     after_search: bool
@@ -204,8 +197,8 @@ class Waits(NamedTuple):
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
     """Merge the other island into the main one's frame, or return the reason to wait.
 
-    Waits also without a solution, and while submaps of the other island are condensed, in a frame
-    that cannot be transformed.
+    Without a solution it waits, too, and while the other island has condensed submaps, whose frame
+    cannot be transformed.
     """
     if other.graph.condensed is not None:
         return Waits("its submaps are condensed in a frame of their own", after_search=False)

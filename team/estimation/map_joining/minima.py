@@ -1,8 +1,8 @@
-"""The search for the lowest minimum: one island solved from several starts.
+"""Search for the lowest minimum: one island solved from several starts.
 
-After a long way without a landmark Gauss-Newton may fold a chain wrongly. A cost far above its
-degrees of freedom, or a lower end of another start, reveals that. A second minimum of similar cost
-is a second map of the same submaps.
+After a long path without landmarks Gauss-Newton may fold a chain wrongly. A cost far above its
+degrees of freedom, or a lower end of another start, reveals it. A second minimum of similar cost is
+a second map of the same submaps.
 """
 
 import math
@@ -36,17 +36,13 @@ from teamslam.team.shapes import Float
 
 Values = Float[np.ndarray, " _"]
 
-SETTLED_M = 1e-3
-"""Length of the last step [m, rad] above which a solution is not yet a minimum."""
-MORE_SOLUTIONS = 4
-"""Further solutions of the best start before it is reported as not settling."""
-FEW_LANDMARKS = 6
-"""Most landmarks with which a chain may fold wrongly at an unsuspicious cost."""
+SETTLED_M = 1e-3  # length of the last step [m, rad] above which a solution is not yet a minimum
+MORE_SOLUTIONS = 4  # further solutions of the best start before it is reported as not settled
+FEW_LANDMARKS = 6  # most landmarks with which a chain may fold wrongly at an unsuspicious cost
 RIVAL = "another map fits about as well"
 MISFIT = "the map does not fit its submaps"
 """First words of the warnings about another minimum, and about the cost."""
-WIDE = 30.0
-"""Cauchy's scale at which the annealed start begins."""
+WIDE = 30.0  # cauchy's scale at which the annealed start begins
 
 
 class Minimum(NamedTuple):
@@ -59,7 +55,7 @@ class Minimum(NamedTuple):
 
 
 class Search(NamedTuple):
-    """The lowest minimum; its cost below the first start's, and below a second minimum."""
+    """The lowest minimum, its gain over the first start, and a second minimum."""
 
     best: Minimum
     gained: float
@@ -78,7 +74,7 @@ def solve_minimum(island: Island) -> Minimum:
 
 
 def likely_rise() -> float:
-    """Quantile of χ² of 3: rise of the cost above which another place is unlikely."""
+    """Return the quantile of χ² of 3 above which another place is unlikely."""
     return likely_limit(3)
 
 
@@ -86,9 +82,8 @@ def search_minima(starts: Sequence[Island]) -> Search:
     """Find the lowest minimum from several starts of one graph, and from the relaxation of its
     headings.
 
-    The first start is the one used without a search. While the cost is suspicious, or with few
-    landmarks, starts without inter-robot measurements and with wide robust scales are tried too.
-    Raises NotDeterminedError where no start has a solution.
+    While the cost is suspicious, or with few landmarks, starts without inter-robot measurements and
+    with wide robust scales are tried too. Raises NotDeterminedError if no start has a solution.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     found = list(_solve_each(starts))
@@ -111,10 +106,10 @@ def _solve_each(starts: Iterable[Island]) -> Iterator[Minimum]:
 
 
 def widen_search(search: Search) -> Search:
-    """Extend the search by the minima next to the best one, where landmarks are few.
+    """Extend the search by the minima next to the best one, for maps with few landmarks.
 
-    Each uncertain heading of a first or last pose is moved as far as is likely, and each stream
-    mirrored at the line through two landmarks, to which a chain may fold over.
+    Each uncertain heading of a first or last pose is displaced as far as is likely, and each stream
+    is mirrored at the line through two landmarks.
     """
     best = search.best.island
     if len(best.graph.landmarks) > FEW_LANDMARKS:
@@ -173,10 +168,7 @@ def _select_lowest(found: Sequence[Minimum]) -> Search:
 
 
 def _make_starts(island: Island) -> Iterator[Island]:
-    """Make starts independent of the state, the most promising first.
-
-    None with condensed submaps, which depend on that state.
-    """
+    """Make starts independent of the state, most promising first; none with condensed submaps."""
     graph = island.graph
     if graph.condensed is not None:
         return
@@ -207,8 +199,8 @@ def _settle_minimum(best: Minimum) -> Minimum:
 
 
 def is_another_minimum(one: Minimum, best: Minimum) -> bool:
-    """Whether a minimum is another map, rather than a state within the best one's covariance, which
-    predicts a rise of the cost by dᵀAd.
+    """Return whether a minimum is another map: dᵀAd, the rise that the best one's covariance
+    predicts for the difference d, exceeds `likely_rise`.
     """
     difference = _difference(one.island, best.island)
     return _quadratic(best.island, difference) > likely_rise()
@@ -227,7 +219,7 @@ def _quadratic(island: Island, x: Values) -> float:
 
 
 def rival_distance(search: Search) -> float | None:
-    """Distance [m] of the second minimum from the best one, if as likely and significant."""
+    """Compute the distance [m] of a second minimum that is as likely and significantly apart."""
     if search.second is None or not search.ambiguous:
         return None
     island = search.best.island

@@ -1,8 +1,8 @@
 """Detect a pose covariance that understates the uncertainty: a curved valley of the cost.
 
-One heading is displaced and everything else solved given that: the profile of the cost (Bates &
-Watts 1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement; after a long
-way without a landmark that χ² may be ten times the rise.
+One heading is displaced and everything else solved given it: the profile of the cost (Bates & Watts
+1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement; after a long path
+without landmarks that χ² may be ten times the rise.
 """
 
 from collections.abc import Iterator
@@ -23,23 +23,19 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
 )
 from teamslam.team.estimation.se2 import compose, inverse, logarithm
 
-STEPS = (1.0, 2.0, 3.0)
-"""Displacements of a heading, in its standard deviations."""
+STEPS = (1.0, 2.0, 3.0)  # displacements of a heading, in its standard deviations
 ITERATIONS = 4
 SHORTEST = 0.01
-"""Squared length, in standard deviations, of the last step: shorter ones change the cost, whose
-rises are reported to a tenth, by less.
+"""Squared length, in standard deviations, of the last step; shorter ones change the reported rises
+by less than a tenth.
 """
 STRAIGHT_RAD = 0.1
 """Standard deviation [rad] of a heading below which the cost is taken as quadratic."""
 BENT = 4.0
-"""Ratio of χ² by the covariance to the rise of the cost that is reported: the ellipse is too short
-by half.
+"""Reported ratio of χ² by the covariance to the rise of the cost: the ellipse is too short by half.
 """
 UNLIKELY = 10.8275661707
-"""Rise of the cost beyond which a place is not considered: `chi2_limit(1, 1e-3)`, the 99.9 %
-quantile of χ² of 1.
-"""
+"""Rise of the cost beyond which a place is not considered: `chi2_limit(1, 1e-3)`."""
 
 
 class UnderstatedUncertainty(NamedTuple):
@@ -51,12 +47,12 @@ class UnderstatedUncertainty(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """χ² over the rise of the cost; 1 where the cost is quadratic."""
+        """χ² over the rise of the cost; 1 for a quadratic cost."""
         return self.chi2 / max(self.rise, 1.0)
 
 
 def heading_sigma(island: Island, node: int) -> float:
-    """Standard deviation [rad] of a pose's heading; 0 for a given pose."""
+    """Compute the standard deviation [rad] of a pose's heading; 0 for a given pose."""
     graph = island.graph
     if graph.fixed[node]:
         return 0.0
@@ -66,7 +62,7 @@ def heading_sigma(island: Island, node: int) -> float:
 def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
     """Profile the cost: islands with one heading displaced, and each rise.
 
-    Empty where the heading is known too well for a curved valley.
+    Empty if the heading deviates by less than STRAIGHT_RAD.
     """
     _, covariance = joint_marginal(island, [node])
     sigma = deviation(covariance[2, 2])
@@ -86,7 +82,7 @@ def profile(island: Island, node: int) -> Iterator[tuple[Island, float]]:
 
 
 def ends(island: Island) -> list[tuple[Stream, str, int]]:
-    """List the first and last pose of every stream unless given, named in words."""
+    """List the first and last pose of every stream unless given, with a word for each."""
     return [
         (stream, where, nodes[k])
         for stream, nodes in sorted(island.graph.streams.items())
@@ -96,7 +92,7 @@ def ends(island: Island) -> list[tuple[Stream, str, int]]:
 
 
 def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty | None:
-    """Find the likely place of a pose that its covariance underrates most."""
+    """Find the likely place of a pose that its covariance understates most."""
     mean, covariance = joint_marginal(island, [node])
     # The χ² is that of the motion mean ∘ Exp(η), so that a turn about a far point is not taken for
     # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.

@@ -1,11 +1,9 @@
 """Add the members of a tick to a fold; refuse those that allow no solution, with a reason.
 
-A tick without a solution as a whole is added one by one in canonical order, without the members
-that make the normal equations unsolvable (law 2).
-
-A refused submap is reduced to its motion, the marginal of its end pose. Where that fails too, the
-robot's chain ends. An unsolvable initial pose becomes unknown; an inter-robot measurement is
-left out.
+If a tick as a whole has no solution, its members are added in canonical order without those that
+make the normal equations unsolvable (law 2). A refused submap is reduced to its motion, the
+marginal of its end pose; where that fails too, the robot's chain ends. An unsolvable initial pose
+becomes unknown; an inter-robot measurement is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,7 +29,7 @@ T = TypeVar("T")
 
 
 def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
-    """Add the tick's members; list exceptions in `refused`, `motion_only`, `left_out` and
+    """Add the tick's members; record exceptions in `refused`, `motion_only`, `left_out`,
     `set_aside`.
     """
     fold = replace(fold, set_aside=(*fold.set_aside, *tick.set_aside))
@@ -47,7 +45,7 @@ def add_members(fold: Fold, tick: Tick, settings: JoinSettings) -> Fold:
 
 
 def describe_refusals(fold: Fold) -> list[str]:
-    """Describe the submap at which each chain ended and how many follow, then other refusals."""
+    """Describe where each chain ended and how many submaps follow, then other refusals."""
     ended: dict[Stream, list[int]] = {}
     for _, robot, incarnation, sequence in fold.refused:
         ended.setdefault((robot, incarnation), []).append(sequence)
@@ -107,7 +105,7 @@ def _attempt(
 
 
 class _Selection:
-    """Selects the solvable members of a tick one by one, in canonical order."""
+    """Selection of a tick's solvable members, one by one in canonical order."""
 
     def __init__(
         self, fold: Fold, settings: JoinSettings, starts: Mapping[Stream, InitialPoseFactor]
@@ -123,7 +121,7 @@ class _Selection:
     def add_solvable(
         self, members: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
     ) -> Fold:
-        """Add the submaps, then inter-robot measurements, waiting ones included."""
+        """Add the submaps, then new and waiting inter-robot measurements."""
         unseen = replace(self._fold, waiting=())
         self._grow(unseen, members)
         base = replace(

@@ -1,11 +1,11 @@
-"""A first guess of a whole graph: headings as free vectors.
+"""First guess of a whole graph: headings as free vectors.
 
 With (c, s) = (cos θ, sin θ) of each pose as two free numbers, a submap's equations are linear,
 
     p − p_s − [[c_s, −s_s], [s_s, c_s]] z = 0,   (c, s)_e − R(z_θ) (c, s)_s = 0,
 
-so least squares has one minimum, however long the way without a landmark (chordal relaxation:
-Martinec & Pajdla 2007, Carlone et al. 2015). Weights leave correlations out.
+so least squares has one minimum (chordal relaxation: Martinec & Pajdla 2007, Carlone et al. 2015).
+Weights leave correlations out.
 """
 
 import math
@@ -32,7 +32,7 @@ class _Rows(NamedTuple):
 
 
 def relax_headings(graph: Graph, state: Values) -> Values | None:
-    """Relax the graph to a new state; fixed nodes and biases stay; None if undetermined."""
+    """Relax the graph to a new state; fixed nodes and biases stay. None if undetermined."""
     sizes = np.diff(graph.offset).tolist()
     at = np.concatenate([[0], np.cumsum([4 if size == 3 else size for size in sizes])])
     numbers = np.zeros(at[-1])

@@ -1,8 +1,8 @@
-"""Restore condensed submaps: at a few sizes of the fold, and where a tick contradicts them.
+"""Restore condensed submaps at a few sizes of the fold, and where a tick contradicts them.
 
 Submaps linearised at different headings make the map overconfident. At begin · GROWTH^k submaps, up
-to SETTLED, and at a tick that moves them further, all condensed submaps are restored, solved, and
-condensed anew.
+to SETTLED, and at a tick that moves them beyond their linearisation, all condensed submaps are
+restored, solved, and condensed anew.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,16 +33,13 @@ from teamslam.team.shapes import Float
 
 Values = Float[np.ndarray, " _"]
 
-GROWTH = 1.5
-"""Ratio of successive sizes at which the fold is linearised again."""
-SETTLED = 1000
-"""Number of submaps above which the fold is not linearised again."""
-SOLVED = 3
-"""Repetitions of a tick's iterations for a fold that is linearised again."""
+GROWTH = 1.5  # ratio of successive sizes at which the fold is linearised again
+SETTLED = 1000  # number of submaps above which the fold is not linearised again
+SOLVED = 3  # repetitions of a tick's iterations after restoring
 
 
 def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
-    """Whether the fold passes a size at which it is linearised again."""
+    """Return whether the fold passes a size at which it is linearised again."""
     size = begin * GROWTH
     while size <= min(after, SETTLED):
         if before < size:
@@ -52,10 +49,10 @@ def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
 
 
 def is_contradicted(before: Fold, after: Fold) -> bool:
-    """Whether a tick changes the condensed submaps beyond their linearisation.
+    """Return whether a tick changes the condensed submaps beyond their linearisation.
 
-    So do a closure of unnamed landmarks, the first unnamed landmarks, and a new main island, into
-    whose frame the former one will be transformed.
+    This holds for a closure, the first unnamed landmarks, and a new main island, into whose frame
+    the former one will be transformed.
     """
     begins = after.has_unnamed and not before.has_unnamed
     return bool(after.landmarks.opened) or begins or before.main_key != after.main_key
@@ -64,10 +61,10 @@ def is_contradicted(before: Fold, after: Fold) -> bool:
 def restore_submaps(
     fold: Fold, contributions: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
 ) -> Fold:
-    """Restore the condensed submaps as factors, and solve their islands; unchanged without a
+    """Restore the condensed submaps as factors and solve their islands; unchanged without a
     solution.
 
-    contributions, sightings: all of the fold in canonical order, even refused ones.
+    contributions, sightings: all of the fold in canonical order, with refused ones.
     """
     contributions = cut_members(contributions, fold.cuts)
     sightings = cut_members(sightings, fold.cuts)

@@ -1,16 +1,15 @@
 """Saved maps of earlier days in an island: tests of their landmarks, and landmarks that moved.
 
-A saved map is a Gaussian over its landmarks in a free frame. Adding a displacement e of landmark i
-to its place z_i in it lowers the joint cost by
+A saved map is a Gaussian over its landmarks in a free frame. A displacement e of landmark i from
+its place in it lowers the joint cost by
 
     χ²_i = g_iᵀ M_ii⁻¹ g_i,   g = W r,   M = W − W J Σ Jᵀ W,
 
 with the map's residual r, information W and Jacobian J, and the island's covariance Σ; e = M_ii⁻¹
 g_i with covariance M_ii⁻¹ (Baarda 1968). Without a displacement χ²_i has two degrees of freedom. A
-landmark beyond the limit gets a second node, its former place, which the map alone has; the others
-are tested again, the worst first. An unnamed landmark is known by its place alone, and a submap may
-have associated its neighbour: two submaps are needed to move it, and the association of one is
-undone.
+landmark beyond the limit gets a second node, its former place, which the map alone observes; the
+others are tested again, the worst first. A submap may associate an unnamed landmark with its
+neighbour, so two submaps are needed to move it, and the association of one is undone.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -37,20 +36,16 @@ from teamslam.team.estimation.map_joining.submap_graph import (
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.shapes import Bool, Float
 
-FALSE_ALARM = 1e-3
-"""Probability that a landmark which has not moved is taken for moved, in the final map."""
-SEQUENTIAL = 1e-6
-"""The same of one test in a running map, which repeats it with every tick."""
+FALSE_ALARM = 1e-3  # probability that an unmoved landmark counts as moved in the final map
+SEQUENTIAL = 1e-6  # the same of one test in a running map, repeated with every tick
 NEGLIGIBLE = 1e-9
 """Share of a landmark's information that the rest of a map must test for a test to count."""
 LEAST_SUBMAPS = 2
 """Fewest submaps that place a landmark elsewhere for it to have moved, if it has no number or its
-former place is empty: one may have another landmark's place, or number.
+former place is empty.
 """
-LEAST_AGREEING = 3
-"""Fewest landmarks that must agree where others disagree."""
-MOST_PAIRS = 2000
-"""Most pairs of shared landmarks from which a frame is proposed."""
+LEAST_AGREEING = 3  # fewest landmarks that must agree where others disagree
+MOST_PAIRS = 2000  # most pairs of shared landmarks from which a frame is proposed
 
 
 class Displacement(NamedTuple):
@@ -67,7 +62,7 @@ class Displacement(NamedTuple):
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation [m] of one coordinate, both directions' mean."""
+        """Standard deviation [m] of one coordinate, the mean of both."""
         return deviation(0.5 * float(np.trace(self.covariance)))
 
 
@@ -86,7 +81,7 @@ def displacements(
 ) -> list[Displacement]:
     """Estimate the displacement of each landmark of a saved map that others determine, by id.
 
-    among: the nodes to test, without those apart; None: all.
+    among: nodes to test, without those apart; None: all.
     """
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     nodes = saved.landmarks.tolist()
@@ -104,7 +99,7 @@ def displacements(
 
 
 def displacements_apart(island: Island, stream: Stream) -> list[Displacement]:
-    """Estimate the displacements of landmarks apart from a saved map."""
+    """Estimate the displacements of a saved map's landmarks with two nodes."""
     landmarks = island.graph.landmarks
     return [
         _apart(island, id_, former, landmarks[id_])
@@ -114,9 +109,7 @@ def displacements_apart(island: Island, stream: Stream) -> list[Displacement]:
 
 
 def is_confirmed(graph: Graph, saved: Joined, id_: int) -> bool:
-    """Return whether LEAST_SUBMAPS submaps beside a saved map have a landmark, or a condensed
-    one.
-    """
+    """Return whether LEAST_SUBMAPS other submaps, or a condensed one, observe a landmark."""
     node = graph.landmarks[id_]
     if graph.condensed is not None and (graph.condensed.nodes == node).any():
         return True
@@ -132,7 +125,7 @@ def _observed_by_others(graph: Graph, saved: Joined) -> set[int]:
 def _tests(
     island: Island, saved: Joined, tested: Sequence[int]
 ) -> list[tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"], float] | None]:
-    """Compute (displacement, covariance, χ²) of landmarks, by index in the saved map; None where
+    """Compute (displacement, covariance, χ²) of landmarks, by index in the saved map; None if
     undetermined.
     """
     if not tested:
@@ -195,7 +188,7 @@ def _apart(island: Island, id_: int, former: int, present: int) -> Displacement:
 
 
 def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
-    """Give landmarks of a saved map a node of their former place."""
+    """Add a node for the former place of landmarks of a saved map."""
     graph, state = island.graph, island.state
     stream = saved.contribution.stream
     nodes = {node: k for k, node in enumerate(saved.landmarks.tolist())}
@@ -210,7 +203,7 @@ def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
 
 
 def dissociate(island: Island, saved: Joined, id_: int) -> Island:
-    """Give the other submaps' place of a saved map's landmark to a new unnamed landmark."""
+    """Assign the other submaps' place of a saved map's landmark to a new unnamed landmark."""
     apart = separate(island, saved, [id_])
     former = dict(apart.graph.former)
     place = former.pop((saved.contribution.stream, id_))
@@ -221,7 +214,7 @@ def dissociate(island: Island, saved: Joined, id_: int) -> Island:
 
 
 def reunite(island: Island, stream: Stream, id_: int) -> Island:
-    """Make a landmark's former place and its present one the same again."""
+    """Tie a landmark's former place to its present one."""
     graph = island.graph
     former = {at: node for at, node in graph.former.items() if at != (stream, id_)}
     node = graph.former[stream, id_]
@@ -237,7 +230,7 @@ def next_change(
 ) -> tuple[Joined, Displacement] | None:
     """Find the landmark that disagrees most with its place in a saved map, beyond chance.
 
-    nodes: those to test in a running map, where an unnamed landmark awaits its second submap.
+    nodes: those to test in a running map, in which an unnamed landmark needs a second submap.
     """
     limit, graph = chi2_limit(2, chance), island.graph
     found = [
@@ -254,7 +247,7 @@ def next_change(
 
 
 def returned(island: Island, chance: float) -> list[tuple[Stream, int]]:
-    """List the landmarks apart whose two places are one within chance."""
+    """List the landmarks apart whose two places agree within chance."""
     limit = chi2_limit(2, chance)
     return [
         (saved.contribution.stream, each.landmark)
@@ -265,9 +258,7 @@ def returned(island: Island, chance: float) -> list[tuple[Stream, int]]:
 
 
 class Replaced(NamedTuple):
-    """An error of a robot today and in a saved map; χ² of one degree of freedom that they are
-    equal.
-    """
+    """Error of a robot that differs from a saved map; chi2: one degree of freedom."""
 
     error: RobotBias
     saved: Stream
@@ -294,7 +285,7 @@ def replaced_sensors(island: Island) -> list[Replaced]:
 
 
 def contradiction(island: Island) -> tuple[Stream, str] | None:
-    """Find a saved map with most of today's landmarks elsewhere, with the reason."""
+    """Find a saved map with most of today's landmarks elsewhere; return the reason."""
     for saved in maps_of(island.graph):
         stream = saved.contribution.stream
         moved = sum(of == stream for of, _ in island.graph.former)
@@ -335,8 +326,8 @@ def agreeing(
 ) -> Bool[np.ndarray, " n"]:
     """Mark the landmarks of two maps, N(a, A) and N(b, B), that one rigid motion places.
 
-    From the largest set by the motion of a pair those that disagree are removed, the worst first,
-    and those that agree added again.
+    From the largest set by the motion of a pair, those that disagree are removed, the worst first,
+    and those that agree are added.
     """
     agree = np.ones(len(a), np.bool_)
     if _disagreements(a, A, b, B, agree).max() > limit:
@@ -375,7 +366,7 @@ def _largest_agreement(
     """Mark the most landmarks that the rigid motion of one pair places within the limit.
 
     The motion from i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps middle to middle. A difference has the
-    covariance of both places, less what they share with the pair.
+    covariance of both places, less their correlation with the pair.
     """
     n = len(a)
     best = np.zeros(n, np.bool_)
@@ -429,7 +420,7 @@ def _disagreements(
     B: Float[np.ndarray, "m m"],
     agree: Bool[np.ndarray, " n"],
 ) -> Float[np.ndarray, " n"]:
-    """χ² of two degrees of freedom of each landmark against those that agree.
+    """Compute each landmark's χ² of two degrees of freedom against those that agree.
 
     With d = a − (R b + t) at the motion of the agreeing landmarks I, their covariance D and
     Jacobian J by the motion of covariance N: in I by the module's equation; any other k is

@@ -1,7 +1,6 @@
 """Split a node of a graph between its submaps, and drop a submap: hypotheses about a misfit.
 
-A moved landmark is two landmarks, before and after; a jump at a seam is two poses. A spoilt submap
-is left out.
+A moved landmark is two landmarks, a jump at a seam two poses; a spoilt submap is left out.
 """
 
 from collections.abc import Collection
@@ -23,14 +22,12 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
 from teamslam.team.estimation.map_joining.submap_graph import append_nodes
 from teamslam.team.shapes import Float
 
-ITERATIONS = 15
-"""Most steps after a split."""
-TOLERANCE = 1e-4
-"""Largest change [m, rad] of the last step."""
+ITERATIONS = 15  # most steps after a split
+TOLERANCE = 1e-4  # largest change [m, rad] of the last step
 
 
 def robust(island: Island) -> Island:
-    """Solve an island with a robust loss, if it has none."""
+    """Solve an island with a robust loss, unless it has one."""
     settings = island.settings
     if settings.robust:
         return island
@@ -41,7 +38,7 @@ def robust(island: Island) -> Island:
 def split(
     island: Island, node: int, submaps: Collection[int], value: Float[np.ndarray, " k"]
 ) -> Island:
-    """Give some submaps, by place in the graph, a node of their own (the last) for `node`."""
+    """Assign a new, last node to some submaps (by place in the graph) instead of `node`."""
     grown, state, new = append_nodes(island.graph, island.state, [value])
     split_up = tuple(
         each._replace(nodes=np.where(each.nodes == node, new[0], each.nodes))
@@ -53,7 +50,7 @@ def split(
 
 
 def without(island: Island, places: Collection[int]) -> Island:
-    """Drop submaps by place in the graph; a pose that nothing measures is fixed."""
+    """Drop submaps by place in the graph; fix poses that nothing measures."""
     graph = island.graph
     keep = np.array([at not in places for at in range(len(graph.submaps))], np.bool_)
     left = tuple(each for at, each in enumerate(graph.submaps) if keep[at])
@@ -70,7 +67,7 @@ def without(island: Island, places: Collection[int]) -> Island:
 
 
 def resolved(island: Island) -> tuple[Island, float] | None:
-    """Solve at final robust scales; return the solution and its cost."""
+    """Solve at final robust scales; return the solution and its cost, or None."""
     island, damping = age_factors(island, FULL_AGE), 0.0
     try:
         for _ in range(ITERATIONS):
