@@ -147,11 +147,12 @@ class MapPublisher:
     def _announce_withdrawals(self, now_ns: int) -> list[Outgoing]:
         """Publish the fold's new withdrawals; late submaps may revoke one."""
         found = self.fold.convicted
-        for robot in sorted(self._announced.keys() - found.keys()):
-            del self._announced[robot]
-            self.warnings.append(f"{robot} is withdrawn no more: what came late speaks for it")
+        self.warnings += [
+            f"{robot} is withdrawn no more: what came late speaks for it"
+            for robot in sorted(self._announced.keys() - found.keys())
+        ]
         new = [robot for robot in found if robot not in self._announced]
-        self._announced |= found
+        self._announced = dict(found)
         self.warnings += [f"{robot} withdrawn by central: {found[robot]}" for robot in new]
         return [
             Outgoing(

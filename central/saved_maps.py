@@ -12,19 +12,12 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import RobotBias, is_absolute, is_map, named, whole_of
 from teamslam.team.estimation.gaussian import information
+from teamslam.team.estimation.map_joining import saved_maps
 from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import joint, points_of
-from teamslam.team.estimation.map_joining.saved_maps import (
-    FALSE_ALARM,
-    SEQUENTIAL,
-    displacements,
-    is_confirmed,
-    maps_of,
-    replaced_sensors,
-)
 from teamslam.team.estimation.map_joining.submap_graph import DRIFT
 from teamslam.team.saved_map import datum_bytes
 from teamslam.team.shapes import Float
@@ -83,7 +76,7 @@ def save_map(
     among = 0.5 * (among + among.T)
     given = among[K:, K:]
     for each in fused.changes:
-        if each.state == "moved" and each.chi2 < chi2_limit(2, SEQUENTIAL):
+        if each.state == "moved" and each.chi2 < chi2_limit(2, saved_maps.SEQUENTIAL):
             at, e = 2 * chosen.index(each.landmark), np.array([each.dx, each.dy])
             given[at : at + 2, at : at + 2] += np.outer(e, e)
     if "range_scale" not in biases:
@@ -183,7 +176,7 @@ def sensor_warnings(fold: Fold) -> Iterator[str]:
     """Warn of robots whose own errors differ from a saved map's."""
     if fold.main_key is None:
         return
-    for each in replaced_sensors(fold.main):
+    for each in saved_maps.replaced_sensors(fold.main):
         robot, bias = each.error
         yield (
             f"{robot}: its {bias} is {each.value:.3g} and was {each.before:.3g} in "
@@ -202,11 +195,13 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     if fold.main_key is None:
         return ()
     graph = fold.main.graph
-    earlier = [each for each in maps_of(graph) if not is_absolute(each.contribution.stream)]
+    earlier = [
+        each for each in saved_maps.maps_of(graph) if not is_absolute(each.contribution.stream)
+    ]
     if not earlier:
         return ()
     island, found = fold.main, dict[int, m.LandmarkChange]()
-    limit = chi2_limit(2, FALSE_ALARM)
+    limit = chi2_limit(2, saved_maps.FALSE_ALARM)
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     own = {
         node
@@ -218,9 +213,9 @@ def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange
     old: set[int] = {id_ for stream, id_ in graph.former if not is_absolute(stream)}
     for saved in earlier:
         old |= {id_of[node] for node in saved.landmarks.tolist() if node in id_of}
-        for each in displacements(island, saved):
+        for each in saved_maps.displacements(island, saved):
             is_beyond, is_unnamed = each.is_apart or each.chi2 > limit, each.landmark >= UNNAMED
-            is_sure = not is_beyond or is_confirmed(graph, saved, each.landmark)
+            is_sure = not is_beyond or saved_maps.is_confirmed(graph, saved, each.landmark)
             if each.is_apart and (is_unnamed or not is_sure):
                 former[each.landmark] = graph.former[saved.contribution.stream, each.landmark]
             before = found.get(each.landmark)
@@ -252,7 +247,7 @@ def _judge_former_places(
     for id_, absence in zip(
         [*unseen, *former], absences(island, np.concatenate(places)), strict=True
     ):
-        is_empty = absence.chance < FALSE_ALARM
+        is_empty = absence.chance < saved_maps.FALSE_ALARM
         if id_ in former and id_ >= UNNAMED:
             if not is_empty:
                 yield m.LandmarkChange(landmark=id_, state="new")

@@ -11,14 +11,7 @@ import numpy as np
 from teamslam.central.config import CentralConfig, SurveyedLandmark
 from teamslam.team.config import GNSS, SURVEY, SURVEY_FRAME
 from teamslam.team.datum import Datum
-from teamslam.team.estimation.contribution import (
-    STATION,
-    SURVEYED,
-    InitialPoseFactor,
-    is_absolute,
-    is_map,
-    named,
-)
+from teamslam.team.estimation import contribution
 from teamslam.team.estimation.inter_robot import STATION_POSE
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.saved_maps import displacements_apart
@@ -32,7 +25,9 @@ DIGEST = bytes(8)
 """The configuration names the survey, its submap names no other one."""
 
 
-def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPoseFactor]:
+def survey_of(
+    surveyed: Sequence[SurveyedLandmark],
+) -> tuple[Submap, contribution.InitialPoseFactor]:
     """Make the submap of surveyed landmarks about their centroid, and its exact start."""
     order = sorted(surveyed, key=lambda each: each.landmark)
     points = np.array([[each.x, each.y] for each in order])
@@ -48,13 +43,13 @@ def survey_of(surveyed: Sequence[SurveyedLandmark]) -> tuple[Submap, InitialPose
         from_ids([1] * len(order)),
         config=DIGEST,
     )
-    return submap, InitialPoseFactor(*SURVEYED, np.array([*origin, 0.0]))
+    return submap, contribution.InitialPoseFactor(*contribution.SURVEYED, np.array([*origin, 0.0]))
 
 
-def station() -> tuple[Submap, InitialPoseFactor]:
+def station() -> tuple[Submap, contribution.InitialPoseFactor]:
     """Make the station of fixes, a submap without landmarks, and its start."""
     submap = member_of(GNSS, b"", np.zeros(0), np.zeros((0, 0)), b"", config=DIGEST)
-    return submap, InitialPoseFactor(*STATION, STATION_POSE)
+    return submap, contribution.InitialPoseFactor(*contribution.STATION, STATION_POSE)
 
 
 def datum_of(config: CentralConfig, fused: FusedMap, maps: Iterable[SavedMap]) -> Datum | None:
@@ -73,13 +68,15 @@ def survey_warnings(fold: Fold) -> Iterator[str]:
     """Warn of surveyed landmarks that contradict the map, and of saved maps with a survey."""
     if not fold.contributions:
         return
-    for stream in sorted(s for s in fold.starts if is_map(s) and SURVEYED in fold.starts):
-        if not is_absolute(stream):
+    for stream in sorted(
+        s for s in fold.starts if contribution.is_map(s) and contribution.SURVEYED in fold.starts
+    ):
+        if not contribution.is_absolute(stream):
             yield (
-                f"{named(stream)} contains a survey, which central.surveyed counts a second time: "
+                f"{contribution.named(stream)} contains a survey, which central.surveyed counts a second time: "
                 "leave that out"
             )
-    for each in displacements_apart(fold.main, SURVEYED):
+    for each in displacements_apart(fold.main, contribution.SURVEYED):
         yield (
             f"the surveyed landmark {each.landmark} is ({each.by[0]:+.2f}, {each.by[1]:+.2f}) m "
             f"from its surveyed place, with a standard deviation of {each.sigma_m:.2g} m (chi² "

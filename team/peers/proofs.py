@@ -6,10 +6,8 @@ A certificate of a later generation, or a roster, revokes the earlier ones. An o
 contains its certificate.
 """
 
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from teamslam.team.keys.roster import Issued
 from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.replica import Replica
 from teamslam.team.wire import messages as m
@@ -92,7 +90,11 @@ class Proofs:
 
     def _refused_of_robot(self, member: Member, robot: str, replica: Replica) -> str | None:
         node = f"robot-{robot}"
-        issued = list(self._issued_to(node, replica.certificates_of(robot)))
+        issued = [
+            (found, certificate)
+            for certificate in replica.certificates_of(robot)
+            if not isinstance(found := self._signer.issued(node, certificate), str)
+        ]
         if not issued:
             return f"no certificate of {robot} was received yet"
         least = max(self._signer.revoked(node) + 1, *(each.generation for each, _ in issued))
@@ -108,14 +110,6 @@ class Proofs:
         if all(each.ends_ns < member.message.stamp_ns for each in signed_with):
             return f"stamped after the certificate of {robot} that signed it had ended"
         return None
-
-    def _issued_to(
-        self, node: str, certificates: Iterator[bytes]
-    ) -> Iterator[tuple[Issued, bytes]]:
-        for certificate in certificates:
-            issued = self._signer.issued(node, certificate)
-            if not isinstance(issued, str):
-                yield issued, certificate
 
     def _refused_order(self, member: Member) -> str | None:
         certificate, signature = _split(member.signature)

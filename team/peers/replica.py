@@ -196,12 +196,9 @@ class Replica:
     @property
     def concluded(self) -> dict[str, m.Concluded]:
         """Conclusions of the peers with a final map, by robot."""
-        found = {}
-        for robot, statements in self.statements.items():
-            member = statements.get(("concluded", 0))
-            if member is not None and isinstance(member.message, m.Concluded):
-                found[robot] = member.message
-        return found
+        found = {robot: each.get(("concluded", 0)) for robot, each in self.statements.items()}
+        messages = {robot: each.message for robot, each in found.items() if each is not None}
+        return {r: each for r, each in messages.items() if isinstance(each, m.Concluded)}
 
     def certificates_of(self, robot: str) -> Iterator[bytes]:
         """Yield the certificates of a robot."""
@@ -288,26 +285,31 @@ class Announcement(NamedTuple):
     statements: dict[str, m.Statements]
 
 
+_KINDS = {
+    m.Done: "done",
+    m.SavedMap: "map",
+    m.Withdrawal: "withdrawal",
+    m.GivenUp: "given_up",
+    m.Concluded: "concluded",
+    m.Certificate: "certificate",
+    m.Verdict: "verdict",
+}
+
+
 def _stated(message: m.Message) -> tuple[str, int]:
+    kind = _KINDS.get(type(message))
+    if kind is None:
+        raise RefusedError(f"a {type(message).__name__} is no member of the set")
     match message:
         case m.Done():
-            return "done", message.incarnation
-        case m.SavedMap():
-            return "map", 0
-        case m.Withdrawal():
-            return "withdrawal", 0
-        case m.GivenUp():
-            return "given_up", 0
-        case m.Concluded():
-            return "concluded", 0
+            return kind, message.incarnation
         case m.Certificate():
-            digest = hashlib.blake2b(message.certificate, digest_size=16).digest()
-            return "certificate", int.from_bytes(digest)
+            named = message.certificate
         case m.Verdict():
-            text = f"{message.judgement} {message.withdrawn}".encode()
-            return "verdict", int.from_bytes(hashlib.blake2b(text, digest_size=16).digest())
+            named = f"{message.judgement} {message.withdrawn}".encode()
         case _:
-            raise RefusedError(f"a {type(message).__name__} is no member of the set")
+            return kind, 0
+    return kind, int.from_bytes(hashlib.blake2b(named, digest_size=16).digest())
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
