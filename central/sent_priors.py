@@ -59,15 +59,14 @@ class SentPriors:
         self._sent: dict[Stream, _Sent | None] = {}
         """None: the stream's priors are withdrawn."""
 
-    def worth(
+    def select_worth(
         self,
         fold: Fold,
         streams: Sequence[Stream],
         shown: Sequence[int],
         alone: Collection[Stream] = (),
     ) -> list[Stream]:
-        """Select the streams to which to send a prior of this fold; alone: those that get landmarks
-        alone.
+        """Select the streams to which to send a prior of this fold, or of landmarks `alone`.
 
         Others outside the team's map are selected once, to withdraw theirs.
         """
@@ -88,7 +87,7 @@ class SentPriors:
             )
         ]
 
-    def void(self, fold: Fold, streams: Sequence[Stream]) -> list[Stream]:
+    def select_void(self, fold: Fold, streams: Sequence[Stream]) -> list[Stream]:
         """Select the streams outside the final map, or of a prior in another frame."""
         outside = []
         for stream in streams:

@@ -308,9 +308,9 @@ class SubmapFold:
                     s for s in requested if join_messages.gets_landmarks_alone(of, ids, fused, s)
                 ]
                 requested = (
-                    news.void(of, requested)
+                    news.select_void(of, requested)
                     if fused.final
-                    else news.worth(of, requested, ids, alone)
+                    else news.select_worth(of, requested, ids, alone)
                 )
             out += join_messages.priors(of, ids, fused, requested)
         return out
