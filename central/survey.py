@@ -73,8 +73,8 @@ def survey_warnings(fold: Fold) -> Iterator[str]:
     ):
         if not contribution.is_absolute(stream):
             yield (
-                f"{contribution.named(stream)} contains a survey, which central.surveyed counts a second time: "
-                "leave that out"
+                f"{contribution.named(stream)} contains a survey, which central.surveyed counts a "
+                "second time: leave that out"
             )
     for each in displacements_apart(fold.main, contribution.SURVEYED):
         yield (
