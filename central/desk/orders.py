@@ -111,9 +111,7 @@ def withdraw(
 def give_up(
     bus: Bus, robot: str, reason: str, patience_s: float, signer: "Signer | None" = None
 ) -> None:
-    """Order the team to go on without a lost robot; return on confirmation. Raises
-    WithdrawError.
-    """
+    """Order the team to go on without a lost robot; return when confirmed. Raises WithdrawError."""
     team = _RunningTeam(bus, ch.STATUS)
     team.await_robot(robot)
     node = ch.robot_node(robot)
