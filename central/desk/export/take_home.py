@@ -3,7 +3,7 @@
 import csv
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path as FilePath
@@ -58,17 +58,21 @@ class TakenHome:
 
 def take_home(found: Recorded, progress: Callable[[str], None] = lambda _: None) -> TakenHome:
     """Compute the tables' contents."""
-    counts, classes = _measurement_counts(found), landmark_classes(found)
-    return TakenHome(smoothed_paths(found, progress), counts, _datum(found), classes)
+    config = found.central_config()[0] if "central" in found.configured else None
+    maps, saved = found.of(m.FusedMap, ch.FINAL_MAP), found.saved_maps.values()
+    return TakenHome(
+        paths=smoothed_paths(found, progress),
+        measurements=_measurement_counts(found),
+        datum=None if config is None or not maps else datum_of(config, maps[-1], saved),
+        classes=_landmark_classes(found, () if config is None else config.classes),
+    )
 
 
-def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
+def _landmark_classes(found: Recorded, names: Sequence[str]) -> Mapping[int, tuple[str, float]]:
     """Name (else number) and probability of the likeliest class of each unnamed landmark.
 
     P(c) ∝ Π P(reports | c) over its submaps' landmarks, for equally frequent classes.
     """
-    config = None if "central" not in found.configured else found.central_config()[0]
-    names = () if config is None else config.classes
     rows: dict[Place, Float[np.ndarray, " C"]] = {}
     for submap in found.of(m.Submap, ch.SUBMAP):
         own = [each for each, _ in _detections(submap)]
@@ -87,13 +91,6 @@ def landmark_classes(found: Recorded) -> Mapping[int, tuple[str, float]]:
         name = names[best] if best < len(names) else str(best)
         classes[identity] = name, float(1.0 / np.exp(row - row[best]).sum())
     return classes
-
-
-def _datum(found: Recorded) -> Datum | None:
-    maps = found.of(m.FusedMap, ch.FINAL_MAP)
-    if not maps or "central" not in found.configured:
-        return None
-    return datum_of(found.central_config()[0], maps[-1], found.saved_maps.values())
 
 
 def _measurement_counts(found: Recorded) -> Mapping[int, int]:

@@ -256,12 +256,21 @@ _SCORE_IN_WORDS = (
 
 # The robots' sheets.
 
+
+def _describe_relays(of: SimpleNamespace) -> str:
+    own = f"robot/{of.name}"
+    relays = ((n, k) for n, k in of.peer.over.items() if n.startswith("robot/") and n != own)
+    return ", ".join(f"{node.removeprefix('robot/')} {members}" for node, members in relays)
+
+
 _PEER = (
-    Column("final map", lambda peer: (peer.final_map_sha256 or "none")[:12]),
-    Column("set", "submaps"),
-    Column("at [s]", "complete_at_s", ".1f"),
-    Column("sent [B]", "uplink_bytes", ",.0f"),
-    Column("received [B]", "downlink_bytes", ",.0f"),
+    Column("final map", lambda of: (of.peer.final_map_sha256 or "none")[:12]),
+    Column("set", "peer.submaps"),
+    Column("at [s]", "peer.complete_at_s", ".1f"),
+    Column("sent [B]", "peer.uplink_bytes", ",.0f"),
+    Column("received [B]", "peer.downlink_bytes", ",.0f"),
+    Column("star", "robot.uplink_bytes", ",.0f"),
+    Column("over", _describe_relays),
 )
 PEER_NOTE = (
     "set: submaps of all robots; at: wall time of the final map; sent, received: bytes of "
@@ -272,18 +281,12 @@ PEER_NOTE = (
 
 def peer_sheet(evaluation: Evaluation) -> Sheet:
     """Each robot's final map, part of the set, and traffic."""
-    headings, rows, note = _sheet("robot", _PEER, evaluation.peers.items(), PEER_NOTE)
-    more = []
-    for name, peer in evaluation.peers.items():
-        over = (
-            f"{node.removeprefix('robot/')} {members}"
-            for node, members in peer.over.items()
-            if node.startswith("robot/") and node != f"robot/{name}"
-        )
-        star = format_figure(figure(evaluation.robots.get(name), "uplink_bytes"), ",.0f")
-        more.append((star, ", ".join(over)))
-    whole = [(*row, *last) for row, last in zip(rows, more, strict=True)]
-    return Sheet((*headings, "star", "over"), whole, note)
+    robots = evaluation.robots
+    rows = (
+        (name, SimpleNamespace(name=name, peer=peer, robot=robots.get(name)))
+        for name, peer in evaluation.peers.items()
+    )
+    return _sheet("robot", _PEER, rows, PEER_NOTE)
 
 
 ROBOT_HEADINGS = (
