@@ -1,4 +1,4 @@
-"""Certainty: the probability that a detection is of its associated landmark.
+"""Probability that a detection is of its associated landmark.
 
 For a landmark j in view with probability v_j and detected with probability P_D, the odds of "z is
 of landmark j" against "z is of something else and j was missed" are
@@ -6,8 +6,8 @@ of landmark j" against "z is of something else and j was missed" are
   ψ_j = P_D v_j N(z; ẑ_j, S_j) / ((1 − P_D v_j) ρ_j),    ρ_j = ρ_out + ρ (1 − exp(−ρ V_j)),
 
 with ρ detections per square metre of a view, ρ_out those in no landmark, and V_j = π γ √|S_j| the
-volume of the gate γ. The marginals over all joint associations of a scan, one to one, follow by
-belief propagation (Williams and Lau 2014, IEEE TAES 50(4)).
+volume of the gate γ. Belief propagation gives the marginals over the joint associations of a scan
+(Williams and Lau 2014, IEEE TAES 50(4)).
 """
 
 from dataclasses import dataclass
@@ -21,21 +21,18 @@ from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, predic
 from teamslam.team.estimation.association.smoothing import SmoothedWindow
 from teamslam.team.shapes import Float, Int64
 
-LEAST = 0.1
-"""Least probability that a detected landmark is in view."""
+LEAST = 0.1  # least probability that a detected landmark is in view
 WIDER, FARTHER = 0.5, 1.25
 """Margin [rad] of the sector in view beyond the outermost bearing, and its least range in multiples
-of the median: a robot that stands still sees a landmark at one place only, but views more.
+of the median, for robots that stand still.
 """
-ROUNDS = 30
-"""Most rounds of belief propagation."""
-SETTLED = 1e-6
-"""Change of the messages below which belief propagation ends."""
+ROUNDS = 30  # most rounds of belief propagation
+SETTLED = 1e-6  # change of the messages below which belief propagation ends
 
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """The sector that a window's scans observe, estimated from its own detections.
+    """Sector that a window's scans observe, estimated from its detections.
 
     density: detections of a scan per square metre; area [m²]; looks: number of scans. farthest [m];
     least, most: bearings [rad].
@@ -66,7 +63,7 @@ class FieldOfView:
 
 
 def estimate_view(scans: Scans) -> FieldOfView:
-    """Estimate the sector filled by the detections, before its widening by their noise, and their
+    """Estimate the sector of the detections, without its widening by their noise, and their
     density.
     """
     ranges = core.hypot(scans.points[:, 0], scans.points[:, 1])
@@ -120,7 +117,7 @@ def association_probabilities(
 
 
 def marginals(weights: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:
-    """Compute P(detection i is of landmark j) from the odds ψ_ij, each in at most one pair."""
+    """Compute P(detection i is of landmark j) from the odds ψ_ij, with one-to-one pairs."""
     messages = np.ones_like(weights)
     for _ in range(ROUNDS):
         of_landmark = (weights * messages).sum(axis=0) - weights * messages

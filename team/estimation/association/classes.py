@@ -2,7 +2,7 @@
 
 A landmark has ln P(reports | class c) for each of C classes, up to a constant: the sum of its
 detections' rows. With p(c) ∝ P(reports | c) for equally frequent classes, the log-likelihood ratio
-of one landmark against two is ln(Σ_c p₁(c) p₂(c) C).
+of one landmark against two is ln(C Σ_c p₁(c) p₂(c)).
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.shapes import Float
 
-Classes = Float[np.ndarray, "_ _"]
-"""A row for each landmark, a column for each class."""
+Classes = Float[np.ndarray, "_ _"]  # A row for each landmark, a column for each class
 CONTRADICTED = 3.0
 """Log-likelihood ratio (1 in 20) against one landmark from which a pair is not associated."""
 
@@ -26,9 +25,9 @@ def compare_classes(one: Classes, two: Classes) -> Float[np.ndarray, " n"]:
 
 
 def stack_classes(parts: Sequence[tuple[int, Classes | None]]) -> Classes | None:
-    """Concatenate the classes of several lists, given by count and rows; None where none has any.
+    """Concatenate rows of classes, given with their counts; None if no list has classes.
 
-    Landmarks without classes have zeros; an unreported class is as unlikely as the least likely
+    A landmark without classes has zeros; an unreported class is as unlikely as the least likely
     one.
     """
     most = max((rows.shape[1] for _, rows in parts if rows is not None), default=0)

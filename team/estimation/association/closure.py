@@ -1,12 +1,10 @@
 """Closures: a patch of landmarks found at a place of another part of the map, or of another map.
 
-The patch, the landmarks of a stream's last submaps, is compared with the rest of its island, or
-with another island. Pair voting proposes alignments; each is grown from two of its pairs under the
-joint covariance. Its evidence is the log-likelihood ratio of its pairs less a penalty for absent
-landmarks: those of one side that the other side viewed without having one.
-
-Where a submap's place is uncertain by only a few metres, three common pairs suffice
-(`assign_nearby`).
+The patch, the landmarks of a stream's last submaps, is compared with the rest of its island or with
+another island. Pair voting proposes alignments; each is grown from two of its pairs under the joint
+covariance. Its evidence is the log-likelihood ratio of its pairs less a penalty for absent
+landmarks: those of one side in view of the other side but not observed by it. Where a submap's
+place is uncertain by a few metres only, three common pairs suffice (`assign_nearby`).
 """
 
 from collections.abc import Callable, Sequence
@@ -56,20 +54,13 @@ from teamslam.team.shapes import Float
 
 BEND = 8.0
 """Largest distortion of two maps against each other within a patch, in radii of one object."""
-WEAK = 2
-"""An alignment with fewer votes than the best one's pairs / WEAK is no rival."""
-EXAMINED = 120
-"""Most examined alignments, those with the most matched points."""
-TRIED = 8
-"""Most grown alignments, those with the fewest absent landmarks for their matched ones."""
-WORTH = 3.0
-"""Approximate log-likelihood ratio of a matched point, to select the alignments to grow."""
-SEEDS = 3
-"""Pairs of seeds tried for each alignment."""
-PART = 15
-"""Number of neighbouring landmarks in a part of the patch that votes by itself."""
-LARGE = 150
-"""Number of landmarks from which a patch is halved into parts."""
+WEAK = 2  # an alignment with fewer votes than the best one's pairs / WEAK is no rival
+EXAMINED = 120  # most examined alignments, those with the most matched points
+TRIED = 8  # most grown alignments, those with the fewest absent landmarks for their matched ones
+WORTH = 3.0  # approximate log-likelihood ratio of a matched point, to select the alignments to grow
+SEEDS = 3  # pairs of seeds tried for each alignment
+PART = 15  # number of neighbouring landmarks in a part of the patch that votes by itself
+LARGE = 150  # number of landmarks from which a patch is halved into parts
 TOLERANCE, REACH = 0.4, 30.0
 """Largest distance of matched points in a proposal, and of two points that vote together, in radii
 of one object.
@@ -79,10 +70,10 @@ NEARLY = 2.0
 
 
 class Side(NamedTuple):
-    """Landmarks of one side: their indices in the joint Gaussian, their positions and spreads.
+    """Landmarks of one side: indices in the joint Gaussian, positions and spreads.
 
-    ids, within: their indices in the caller's map and in the whole side. views: landmarks of the
-    whole side that were observed together. parts: groups of neighbours in the whole side.
+    ids, within: indices in the caller's map and in the whole side. views: landmarks of the whole
+    side observed together. parts: groups of neighbours in the whole side.
     """
 
     at: Indices
@@ -94,12 +85,11 @@ class Side(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """A placement of the patch on the target: its pairs, and the part of the target it was grown
-    on.
+    """A placement of the patch on a part of the target.
 
-    absent: number of absent landmarks. evidence: log-likelihood ratio of the pairs less the penalty
-    for them. as_rival: the same, but a landmark with another one beside it, matched or not, is not
-    absent, since in bent maps few pairs of a place are found.
+    absent: number of absent landmarks. evidence: log-likelihood ratio of the pairs less their
+    penalty. as_rival: the same, where a landmark beside another one is not absent, since few pairs
+    are found in bent maps.
     """
 
     merged: Alignment
@@ -111,7 +101,7 @@ class Placement(NamedTuple):
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Pairs by their indices in the patch and in the map of the target."""
+        """Pairs by their indices in the patch and in the target's map."""
         of = dict(zip(self.target.at.tolist(), self.target.ids.tolist(), strict=True))
         return [(pair.first, of[pair.second]) for pair in self.merged.pairs]
 
@@ -171,10 +161,10 @@ def find_closure(
     tests: ClosureTests,
     aliases: Callable[[], Sequence[Placement]] = tuple,
 ) -> Closure | None:
-    """Find the best alignment of a patch with a target and test it; None where none has two pairs.
+    """Find and test the best alignment of a patch with a target; None if none has two pairs.
 
-    aliases: returns alignments that are certainly wrong: evidence as strong as theirs proves no
-    place.
+    aliases: returns alignments that are certainly wrong, with whose evidence a closure must
+    compete.
     """
     found = align(patch, target, joint_of, profile, tests.pairs)
     if not found:
@@ -243,11 +233,10 @@ def _count_missing(
     views: tuple[Views, Views],
     profile: AssociationProfile,
 ) -> tuple[int, int]:
-    """Count the absent points of two sides, and those of them far from all points of the other
-    side.
+    """Return the number of absent points of two sides, and of those far from the other side.
 
-    Sides are given with the matched points' indices. A point close to a matched place may be a part
-    of that landmark, and is not counted.
+    A side is its points and the matched indices. Points close to a matched place may be fragments
+    and are not counted.
     """
     count = surely = 0
     for (points, matched), (own, theirs), seen in ((one, two, views[1]), (two, one, views[0])):
@@ -265,10 +254,10 @@ def _count_missing(
 def combine_maps(
     patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
 ) -> tuple[Joint, Side]:
-    """Combine two maps in the target's frame; return also the target's part in it.
+    """Combine two maps in the target's frame; return the joint map and the target's part in it.
 
     The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
-    map's extent. Only the target's landmarks near the patch as voted are included.
+    map's extent. Only the target's landmarks near the patch are included.
     """
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
@@ -363,9 +352,9 @@ def search_other_island(
 ) -> Closure | None:
     """Search another island for a stream's submaps up to `last`.
 
-    Two statements replace the context: a verdict on a pair, and a saved map, which is of this site,
-    where most of the overlap is matched. Pairs are indices in the two views; the motion maps the
-    first island's frame into the second's.
+    The context is not required with a verdict on a pair, or with a saved map of which most of the
+    overlap is matched. Pairs are indices in the two views; the motion maps the first island's frame
+    into the second's.
     """
     profile = mine.profile
     submaps = mine.find_latest(stream, last)
@@ -416,10 +405,7 @@ def search_other_island(
 
 
 def _saved_share(mine: IslandView, theirs: IslandView, found: Closure) -> float:
-    """Compute the matched share of the overlap between a saved map and the other island.
-
-    All landmarks of the other island count, also those beside the patch.
-    """
+    """Compute the matched share of the overlap between a saved map and the whole other island."""
     first, second = np.array([(pair.first, pair.second) for pair in found.pairs]).T
     sides = [
         (mine, apply_motion(found.motion, mine.joint.mean), first),
@@ -435,8 +421,8 @@ def _saved_share(mine: IslandView, theirs: IslandView, found: Closure) -> float:
 def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     """Find the newest of these submaps whose landmarks are assigned to others.
 
-    The assignment needs SURE_AFTER pairs, one of them with a standard deviation above `near`, the
-    joint evidence of `assign_jointly`, and the share of a closure.
+    This needs SURE_AFTER pairs, one of them with a standard deviation above `near`, the joint
+    evidence of `assign_jointly`, and the share of a closure.
     """
     profile = view.profile
     most_sd = NEARLY * profile.same
@@ -473,7 +459,7 @@ def _find_patch(view: IslandView, submaps: Sequence[int]) -> Indices:
 
 
 def _find_reachable(view: IslandView, patch: Indices) -> Indices:
-    """Find the landmarks that may coincide with the patch's; none where all are certain."""
+    """Find the landmarks that may coincide with the patch's; none if all are certain."""
     others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
     at = evaluate_pairs(view.joint, one, two, view.profile)
@@ -500,7 +486,7 @@ def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
 
 
 def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:
-    """Make the side of a patch, with parts of its last submaps and the halves of a large patch."""
+    """Make a patch's side, with parts of its last submaps and the halves of a large patch."""
     parts = []
     for first in range(len(submaps)):
         part = join_indices([])
@@ -515,7 +501,7 @@ def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Sid
 
 
 def _halve(points: Float[np.ndarray, "n 2"], part: Indices) -> list[Indices]:
-    """Halve a part across its longer side until the halves have fewer than 2 PART points."""
+    """Halve a part across its longer side down to fewer than 2 PART points."""
     if len(part) < 2 * PART:
         return [part]
     own = points[part]

@@ -1,6 +1,6 @@
-"""Clustering: the association of one closed window's detections to landmarks.
+"""Associate one closed window's detections with landmarks, without the map or another window.
 
-It uses no map and no other window, so that submaps stay independent. All particles share it.
+Submaps therefore stay independent. All particles share the association.
 """
 
 from dataclasses import dataclass, replace
@@ -23,17 +23,13 @@ from teamslam.team.estimation.association.smoothing import SmoothedWindow, smoot
 from teamslam.team.estimation.association.tracking import Slip, slip_covariance, track_window
 from teamslam.team.shapes import Bool, Float, Int64
 
-RARE = 0.05
-"""Odds of a landmark below which its detections are clutter."""
-ROUNDS = 5
-"""Most iterations of the share of clutter."""
-UNSEEN = 100.0
-"""Looks at a place of clutter with one match, before the window's own are counted."""
-STATED = 10.0
-"""Looks that the stated detection probability counts as, beside the window's own."""
+RARE = 0.05  # odds of a landmark below which its detections are clutter
+ROUNDS = 5  # most iterations of the share of clutter
+UNSEEN = 100.0  # looks at a place of clutter with one match, before the window's own are counted
+STATED = 10.0  # weight of the stated detection probability, in looks, beside the window's own
 ALIKE = 6.0
-"""a + b of the beta distribution of the landmarks' detection probabilities: they differ by 0.11 at
-0.9, since some are often hidden.
+"""a + b of the beta distribution of the landmarks' detection probabilities, which scatter by 0.11
+at 0.9, since some are often hidden.
 """
 HIDDEN = 0.1
 """Probability that a landmark in view is hidden up to some time of the window, or from it on."""
@@ -43,10 +39,9 @@ HIDDEN = 0.1
 class WindowAssociation:
     """The landmark of each detection of a window.
 
-    landmark_of: by detection, in [0, L), or UNASSIGNED. names: the identity of each landmark, or
+    landmark_of: by detection, in [0, L), or UNASSIGNED. names: identity of each landmark, or
     UNASSIGNED; sorted by name, then by first detection. counts, seen: detections and keyframes of
-    each landmark. clutter: of each detection left out, whether its place was observed again without
-    finding it.
+    each landmark. clutter: detections left out whose place was observed again without a match.
     """
 
     landmark_of: Int64[np.ndarray, " N"]
@@ -59,9 +54,9 @@ class WindowAssociation:
 
 @dataclass(frozen=True)
 class Clusters:
-    """The detections of a window, each of one landmark, before doubtful ones are left out.
+    """Detections of a window, each of one landmark, before doubtful ones are left out.
 
-    window: smoothed. `scans` has larger covariances of the motions that slipped.
+    window: smoothed. scans: with larger covariances of the motions that slipped.
     """
 
     scans: Scans
@@ -137,9 +132,9 @@ def _associate_again(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Associate every scan again, from the smoothed path against all landmarks of the window.
+    """Associate every scan with all landmarks of the window, from the smoothed path.
 
-    A detection without a match becomes a new landmark.
+    A detection without a match becomes a landmark.
     """
     k, n = len(window.poses), len(window.covariance)
     most = n + 2 * len(scans.points)
@@ -172,7 +167,7 @@ def _merge_split(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Merge unnamed landmarks at one place that no scan saw together, the closest pair first."""
+    """Merge unnamed landmarks at one place that no scan observed together, the closest first."""
     count, first = len(names), 3 * len(window.poses)
     seen = _mark_seen(scans, landmark_of, count)
     together = (seen.astype(np.int64) @ seen.T.astype(np.int64)) > 0
@@ -211,8 +206,8 @@ def _drop_uncertain(
 
 
 def _mark_looks(scans: Scans, window: SmoothedWindow) -> Bool[np.ndarray, "L K"]:
-    """Mark the keyframes that observed each landmark's place: they saw something at least as far
-    off, and the place lies between their outermost bearings.
+    """Mark the keyframes in view of each landmark: with a detection at least as far off, and the
+    place between their outermost bearings.
     """
     looks = np.zeros((len(window.landmarks), len(window.poses)), np.bool_)
     bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
@@ -236,17 +231,17 @@ def _weigh_landmarks(
     names: Int64[np.ndarray, " L"],
     settings: AssociationSettings,
 ) -> Float[np.ndarray, " L"]:
-    """Compute the log odds that each landmark is real; ∞ with an identity, at most 0 with too few
+    """Compute the log odds that each landmark is real; ∞ with an identity, ≤ 0 with too few
     detections.
 
     After its first detection, a real landmark is detected at each look with its own probability, of
-    a beta distribution Beta(a, b) whose mean p is that of the window's confirmed landmarks; a place
-    of clutter matches with q. With c detections and m misses the log odds that it is real are
+    a distribution Beta(a, b) with the mean p of the window's confirmed landmarks; a place of
+    clutter matches with q. With c detections and m misses the log odds are
 
       log(B(a + c − 1, b + m)/B(a, b)) − (c − 1) log q − m log(1 − q) + log(real/places of clutter).
 
-    The misses before the first detection count as m log((1 − p)/(1 − q)), at most log HIDDEN, as do
-    those after the last one. q and the last term are those of the window's unconfirmed places.
+    Misses before the first detection count as m log((1 − p)/(1 − q)), at least log HIDDEN, as do
+    those after the last one. q and the last term are of the window's unconfirmed places.
     """
     named = names != UNASSIGNED
     seen = _mark_seen(scans, landmark_of, len(names))

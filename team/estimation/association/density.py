@@ -1,9 +1,9 @@
-"""The local density λ of landmarks, and the lengths that follow from their spacing.
+"""Local density λ of landmarks, and the lengths that follow from their spacing.
 
-The distances of landmarks that one keyframe observed, which are distinct, give the density of
-further landmarks within a radius R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13).
-In groups it is far above the map's mean. Neighbours that hide each other in one keyframe are
-counted in the map, among the landmarks of several submaps.
+The distances of landmarks observed in one keyframe, which are distinct, give the density of further
+landmarks within R of a landmark, K(R) / (π R²) (Ripley 1976, J. Appl. Prob. 13); in groups it is
+far above the map's mean. Neighbours that hide each other in a keyframe are counted among the map's
+landmarks of several submaps.
 """
 
 from collections.abc import Iterable
@@ -16,10 +16,8 @@ from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.shapes import Float
 
-CLOSE = 0.1
-"""Quantile of the landmarks' spacings taken as the spacing within groups."""
-FEWEST = 10
-"""With fewer landmarks that have a neighbour the smallest spacing is used."""
+CLOSE = 0.1  # quantile of the landmarks' spacings taken as the spacing within groups
+FEWEST = 10  # least landmarks with a neighbour; with fewer the smallest spacing is used
 SAME, TIGHT, SLACK = 1.5, 0.5, 0.18
 """Upper bounds of a profile's lengths, in multiples of this spacing."""
 
@@ -30,7 +28,7 @@ Spacings = Float[np.ndarray, "U U"]
 class LandmarkDensity:
     """Spacings of the unnamed landmarks of some submaps, and of the map's landmarks.
 
-    spacings: of each submap. confirmed: positions [m] of the landmarks of several submaps.
+    spacings: of each submap. confirmed: positions [m] of landmarks of several submaps.
     """
 
     def __init__(
@@ -67,9 +65,9 @@ class LandmarkDensity:
         return np.sort(core.hypot(*(self.confirmed[one] - self.confirmed[two]).T))
 
     def of_map(self, radius: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Compute the density [1/m²] of the n landmarks of the map, (2 pairs + 1) / (n π R²).
+        """Compute the density [1/m²] of the map's n landmarks, (2 pairs + 1) / (n π R²).
 
-        Duplicates count as neighbours, so that it is never too small.
+        Duplicates count as neighbours, so it is never too small.
         """
         pairs = np.searchsorted(self._in_map, radius, side="right")
         found: Float[np.ndarray, " k"] = (2.0 * pairs + 1.0) / (

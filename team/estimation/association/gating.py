@@ -1,10 +1,9 @@
-"""The gates: detections against landmarks, and landmarks against landmarks.
+"""Gates: detections against landmarks, and landmarks against landmarks.
 
 Both test the squared Mahalanobis distance d² = dᵀS⁻¹d of a difference d with covariance S against
-χ² of two degrees of freedom (individual compatibility; Neira and Tardós 2001, IEEE T-RA 17(6)).
-
-Two landmarks also have a log-likelihood ratio of "one" against "two": with S plus the slack s₀²,
-and λ expected landmarks per square metre,
+χ² of two degrees of freedom (individual compatibility; Neira and Tardós 2001, IEEE T-RA 17(6)). Two
+landmarks also have a log-likelihood ratio of "one" against "two": with S plus the slack s₀², and λ
+expected landmarks per square metre,
 
   LLR = −½ dᵀS⁻¹d − ½ ln|S| − ln 2π − ln λ,
 
@@ -51,9 +50,9 @@ def match_scan(
 ) -> Int64[np.ndarray, " n"]:
     """Match the detections of a scan with landmarks; UNASSIGNED without a match.
 
-    An unnamed detection matches unnamed landmarks in its gate; a named one the landmark of this
-    name, at any distance. The cost of a pair is dᵀS⁻¹d + ln|S|. points, covariances: of the
-    detections, in the robot's frame [m, m²]. predicted: the landmarks', in that frame.
+    An unnamed detection matches unnamed landmarks in its gate; a named one its landmark at any
+    distance. A pair costs dᵀS⁻¹d + ln|S|. points, covariances, predicted: in the robot's frame [m,
+    m²].
     """
     seen, spread = predicted
     S = spread[None] + settings.variance_factor * covariances[:, None]
@@ -66,9 +65,9 @@ def match_scan(
 def match_best_first(
     allowed: Bool[np.ndarray, "n L"], costs: Float[np.ndarray, "n L"]
 ) -> Int64[np.ndarray, " n"]:
-    """Assign a landmark to each detection of a scan, the allowed pair of least cost first.
+    """Assign a landmark to each detection, the allowed pair of least cost first, or UNASSIGNED.
 
-    UNASSIGNED where no allowed landmark is left. Equal costs keep their order.
+    Equal costs keep their order.
     """
     found = np.full(len(allowed), UNASSIGNED)
     rows, columns = np.nonzero(allowed)
@@ -85,9 +84,9 @@ class Joint(NamedTuple):
 
     mean: positions [m]. covariance: of (x₁, y₁, x₂, …) [m²]. apart: pairs that cannot be one
     landmark, symmetric: observed in one scan, named differently, or declared to be two. density:
-    local; None: that of the profile. unseen: probability that all windows that saw each landmark
-    missed another one beside it; the density of the profile is then an upper bound.
-    apart_in_window: pairs that one submap has as two landmarks, symmetric; None: not recorded.
+    local; None: the profile's. unseen: probability that all windows with a landmark missed another
+    one beside it; the profile's density is then an upper bound. apart_in_window: pairs that are two
+    in one submap, symmetric; None: not recorded.
     """
 
     mean: Float[np.ndarray, "n 2"]
@@ -114,14 +113,14 @@ class Joint(NamedTuple):
         )
 
     def compare_classes(self, first: Indices, second: Indices) -> Float[np.ndarray, " k"]:
-        """Compute the log-likelihood ratio of each pair by its classes; zero without classes."""
+        """Compute each pair's log-likelihood ratio by classes; zero without classes."""
         if self.classes is None:
             return np.zeros(len(first))
         return compare_classes(self.classes[first], self.classes[second])
 
 
 class Pair(NamedTuple):
-    """Two landmarks that are one, with the index of the second.
+    """Two landmarks merged into one, the second.
 
     sd: largest standard deviation [m] of the difference. rival: best LLR of a pair that excludes
     this one.
@@ -135,7 +134,7 @@ class Pair(NamedTuple):
 
 
 class Likelihoods(NamedTuple):
-    """χ², log-likelihood ratio and largest standard deviation of the difference of each pair."""
+    """χ², log-likelihood ratio and largest standard deviation [m] of each pair's difference."""
 
     chi2: Float[np.ndarray, " k"]
     llr: Float[np.ndarray, " k"]
@@ -195,10 +194,7 @@ def required_llr(
     sd: Float[np.ndarray, " k"],
     profile: AssociationProfile,
 ) -> Float[np.ndarray, " k"]:
-    """Return the log-likelihood ratio for which each pair is merged without a rival.
-
-    SPLIT is added where one submap has both.
-    """
+    """Return the log-likelihood ratio that a merge needs, plus SPLIT if one submap has both."""
     least = np.where(sd < profile.tight, profile.llr_tight, profile.llr_loose)
     if joint.apart_in_window is not None:
         least = least + SPLIT * joint.apart_in_window[first, second]

@@ -1,12 +1,11 @@
 """The landmarks of one island as a joint Gaussian, and the steps that merge them in a tick.
 
 The steps: *track* against the last submaps of the same robot; *near*, landmarks of older submaps
-where the standard deviation of the difference is small; *sweep*, landmarks that were split.
+with a small standard deviation of the difference; *sweep*, landmarks that were split.
 
-The landmarks of one submap are distinct, but unmerged fragments of one landmark are candidates for
-each other, and the assignments to all of them at once do not agree on any. So the landmarks of a
-submap are assigned to those of one other submap at a time, with landmarks certainly different from
-these.
+Unmerged fragments of one landmark are candidates for each other, and assignments to all of them at
+once do not agree on any. A submap's landmarks are therefore assigned to those of one other submap
+at a time, with landmarks certainly different from these.
 """
 
 from collections.abc import Iterable, Sequence
@@ -39,8 +38,7 @@ from teamslam.team.estimation.association.visibility import mark_missed, miss_pr
 from teamslam.team.estimation.contribution import Observation, Stream, is_map
 from teamslam.team.shapes import Bool, Float, Int64
 
-COMPARED = 6
-"""Most submaps that one submap is compared with: those with the most candidates."""
+COMPARED = 6  # most submaps that one submap is compared with: those with the most candidates
 REEXAMINED = 8
 """Older undecided submaps that a tick examines again: the newest half, others by turns."""
 REEXAMINED_WITHIN = 10.0
@@ -55,12 +53,12 @@ class ViewedSubmap(NamedTuple):
 
     @property
     def known(self) -> Indices:
-        """Indices of its landmarks without the dropped ones."""
+        """Indices of its landmarks without dropped ones."""
         return self.landmarks[self.landmarks >= 0]
 
     @property
     def unnamed_rows(self) -> Indices:
-        """Index of each of its unnamed landmarks, in its order; −1 for a dropped one."""
+        """Index of each unnamed landmark, in the submap's order; −1 for a dropped one."""
         return self.landmarks[self.observation.ids >= UNNAMED]
 
     @property
@@ -72,20 +70,19 @@ class ViewedSubmap(NamedTuple):
 
     @property
     def views(self) -> list[Indices]:
-        """Indices of the unnamed landmarks that each of its keyframes observed together."""
+        """Indices of the unnamed landmarks that each keyframe observed together."""
         found = self.unnamed_rows
         views = (found[each] for each in self.observation.unnamed.views)
         return [view[view >= 0] for view in views]
 
 
 class IslandView:
-    """An island's landmarks as a joint Gaussian, with the landmarks merged so far.
+    """An island's landmarks as a joint Gaussian, with the merges so far.
 
-    ids: the identity of each landmark; place_of: its index, by identity. seen_by: landmarks of each
-    submap. missed: landmarks that are probably false (`mark_missed`), with which no closure is
-    searched. saved: landmarks of saved maps. sees: landmarks of each submap, updated by merges.
-    merged: landmarks that are merged into another one. ties: the merges. stamp_ns: last end of a
-    submap.
+    ids: identity of each landmark; place_of: its index. seen_by: landmarks of each submap. missed:
+    probably false landmarks (`mark_missed`), left out of closures. saved: landmarks of saved maps.
+    sees: landmarks of each submap, updated by merges. merged: landmarks merged into another. ties:
+    the merges. stamp_ns: last end of a submap.
     """
 
     def __init__(
@@ -172,7 +169,7 @@ class IslandView:
         return apart
 
     def find_place(self, member: LocalLandmark) -> int | None:
-        """Find the index of the landmark that a submap's landmark is part of, if it is here."""
+        """Find the index of the landmark that a submap's landmark is part of."""
         identity = self._landmarks.identity(member)
         return None if identity is None else self.place_of.get(identity)
 
@@ -202,9 +199,8 @@ class IslandView:
         return np.unique(self._merged_into[places])
 
     def find_declared(self, other: "IslandView") -> set[tuple[int, int]]:
-        """Find the landmarks of two islands, by their indices, that an operator declared to be one.
-
-        A pair that another verdict declares to be two is left out.
+        """Find the landmarks of two islands, by index, that an operator declared to be one and not
+        two.
         """
         found: dict[bool, set[tuple[int, int]]] = {True: set(), False: set()}
         for one, two, same in self._landmarks.verdicts:
@@ -215,9 +211,8 @@ class IslandView:
         return found[True] - found[False]
 
     def apply_verdicts(self) -> None:
-        """Merge the landmarks that an operator has declared to be one.
-
-        A merge of landmarks declared to be two has no effect.
+        """Merge the landmarks that an operator declared to be one, unless another verdict forbids
+        it.
         """
         declared = [
             (here, there, each.same)
@@ -236,8 +231,8 @@ class IslandView:
             self.record_merges(MergedPairs((pair,), joint), "verdict")
 
     def track(self, k: int) -> None:
-        """Merge landmarks of submap k with those of the same robot's earlier submaps, then with
-        nearby ones of all other submaps.
+        """Merge landmarks of submap k with the same robot's earlier ones, then with all nearby
+        ones.
         """
         of = self.submaps[k].observation
         fresh = self.submaps[k].unnamed
@@ -248,7 +243,7 @@ class IslandView:
         self.grow("near", fresh, others, self.profile.near)
 
     def grow(self, kind: str, first: Indices, second: Indices, most_sd: float) -> None:
-        """Merge pairs of two lists of landmarks, growing from the most certain pair onwards."""
+        """Merge pairs of two lists of landmarks, the most certain pair first."""
         first, second = first[~self.merged[first]], second[~self.merged[second]]
         if not len(first) or not len(second):
             return
@@ -263,7 +258,7 @@ class IslandView:
             self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:
-        """Merge pairs of submap k and each other submap on which all likely assignments agree."""
+        """Merge pairs of submap k with each other submap on which all likely assignments agree."""
         own = self._resolve(self.submaps[k].unnamed)
         others = self.sees.copy()
         others[k] = False
@@ -274,7 +269,7 @@ class IslandView:
             self.record_merges(found, "near")
 
     def compare_again(self, fresh: Sequence[int], turn: int) -> None:
-        """Compare older undecided submaps near the tick's (`fresh`), perhaps decidable now.
+        """Compare older undecided submaps near the tick's (`fresh`).
 
         turn: selects among many such submaps.
         """
@@ -291,9 +286,10 @@ class IslandView:
             self.compare(k)
 
     def sweep(self) -> None:
-        """Merge landmarks at one place, never seen together, where all likely assignments agree.
+        """Merge landmarks at one place, never observed together, on which all likely assignments
+        agree.
 
-        Pair by pair, each the likeliest by itself, they can turn a robot by a spacing.
+        Merged pair by pair, each the likeliest by itself, they can turn a robot by a spacing.
         """
         at = np.flatnonzero(~self.merged)
         mean = self.joint.mean[at]
@@ -327,9 +323,9 @@ def select_comparisons(
 ) -> list[Indices]:
     """Select the landmarks that `own` may be, for each submap worth a comparison.
 
-    Besides the submap's landmarks these are the rivals that it lacks: without them a landmark that
-    the submap missed would be associated with its neighbour. sees: landmarks of each submap.
-    most_sd: largest standard deviation of a pair's difference.
+    These are the submap's landmarks and the rivals that it lacks, without which a missed landmark
+    would be associated with its neighbour. sees: landmarks of each submap. most_sd: largest
+    standard deviation of a pair's difference.
     """
     others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
     one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)
@@ -353,14 +349,14 @@ def select_comparisons(
 
 
 def find_undecided(joint: Joint, around: Indices, profile: AssociationProfile) -> Indices:
-    """Find those of some landmarks that may be one with another one of them."""
+    """Find the landmarks that may be one with another of them."""
     one, two = (around[each] for each in np.triu_indices(len(around), 1))
     one, two, _ = gate_pairs(joint, one, two, profile, profile.near)
     return np.unique(np.concatenate([one, two]))
 
 
 def select_by_turns(submaps: Sequence[int], turn: int) -> list[int]:
-    """Select the newest REEXAMINED / 2 of these submaps, and as many older ones, by turns."""
+    """Select the newest REEXAMINED / 2 of these submaps, and as many older ones by turns."""
     half = REEXAMINED // 2
     if len(submaps) <= REEXAMINED:
         return list(submaps)

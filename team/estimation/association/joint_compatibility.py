@@ -4,10 +4,10 @@ A merged pair conditions the joint Gaussian for the pairs after it, so the sum o
 ratios (`gating`) is the ratio of all of them together.
 
 `grow_pairs` merges the likeliest pair first, while it has no rival. `assign_jointly` is for
-neighbouring landmarks, each of which may be either of two mapped ones: their relative position
-distinguishes them. An assignment has the weight exp(Σ LLR) of its pairs, and a pair is accepted
-when the assignments that contain it outweigh all others; joint compatibility branch and bound
-(Neira and Tardós 2001, IEEE T-RA 17(6)) accepts the assignment with the most pairs.
+neighbouring landmarks, which their relative position distinguishes: an assignment has the weight
+exp(Σ LLR) of its pairs, and a pair is accepted if the assignments that contain it outweigh all
+others. Joint compatibility branch and bound (Neira and Tardós 2001, IEEE T-RA 17(6)) instead
+accepts the assignment with the most pairs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,18 +29,15 @@ from teamslam.team.estimation.association.gating import (
 )
 from teamslam.team.shapes import Bool, Float
 
-PREGATE = 4.0
-"""Multiple of the gate beyond which a pair is excluded for good."""
+PREGATE = 4.0  # multiple of the gate beyond which a pair is excluded for good
 SURE_AFTER = 3
-"""Number of pairs after which an alignment grows only by pairs of small standard deviation, since
-others connect landmarks one spacing off.
+"""Number of pairs after which an alignment grows only by pairs of small standard deviation; others
+connect landmarks one spacing off.
 """
 MOST_ASSIGNED = 10
-"""Most landmarks that are assigned together: those with the most certain candidates."""
-BEAM = 100
-"""Most assignments that are continued from landmark to landmark."""
-HOPELESS = 12.0
-"""Log weight below the best assignment's [nat] at which another is dropped."""
+"""Most landmarks that are assigned together, those with the most certain candidates."""
+BEAM = 100  # most assignments that are extended by the next landmark
+HOPELESS = 12.0  # log weight below the best assignment's [nat] at which another is dropped
 
 
 class MergedPairs(NamedTuple):
@@ -51,7 +48,7 @@ class MergedPairs(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """Pairs in the order of their merges, and the positions of all landmarks given them [m]."""
+    """Pairs in the order of their merges, and the positions [m] of all landmarks given them."""
 
     pairs: tuple[Pair, ...]
     mean: Float[np.ndarray, "n 2"]
@@ -63,10 +60,10 @@ class Alignment(NamedTuple):
 
 
 def condition_on_pair(joint: Joint, first: int, second: int, profile: AssociationProfile) -> Joint:
-    """Condition the joint Gaussian on two landmarks being one.
+    """Condition the joint Gaussian on two landmarks being one; the second inherits the first's
+    relations.
 
-    With H the difference of the two and S = HPHᵀ + s₀²I, mean −= PHᵀS⁻¹(Hm), P −= PHᵀS⁻¹HP. The
-    second inherits the first's relations.
+    With H the difference of the two and S = HPHᵀ + s₀²I, mean −= PHᵀS⁻¹(Hm), P −= PHᵀS⁻¹HP.
     """
     n = len(joint.mean)
     P = joint.covariance
@@ -98,7 +95,7 @@ def _inherit(relation: Bool[np.ndarray, "n n"], first: int, second: int) -> Bool
 def merge_in_order(
     joint: Joint, pairs: Iterable[tuple[int, int]], profile: AssociationProfile
 ) -> MergedPairs | None:
-    """Merge pairs in this order, each given those before it; None where one fails its gate or is
+    """Merge pairs in this order, each given those before it; None if one fails its gate or is
     apart.
     """
     merged: list[Pair] = []
@@ -120,9 +117,7 @@ def grow_alignment(
     profile: AssociationProfile,
     sure_sd: float,
 ) -> Alignment | None:
-    """Merge the seeds, whatever their rivals, then as `grow_pairs`; None where a seed fails its
-    gate.
-    """
+    """Merge the seeds, whatever their rivals, then as `grow_pairs`; None if one fails its gate."""
     begun = merge_in_order(joint, seeds, profile)
     if begun is None:
         return None
@@ -180,7 +175,6 @@ def grow_pairs(
 def _select_near(
     joint: Joint, first: Indices, second: Indices, profile: AssociationProfile
 ) -> tuple[Indices, Indices]:
-    """Select the pairs that are not apart and within PREGATE gates."""
     open_ = ~joint.apart[first, second]
     first, second = first[open_], second[open_]
     near = evaluate_pairs(joint, first, second, profile).chi2 < PREGATE * profile.gate
@@ -193,8 +187,8 @@ def _grow(
     profile: AssociationProfile,
     limits: tuple[float, float],
 ) -> MergedPairs:
-    """Merge candidates one by one; limits: largest standard deviations, before and once SURE_AFTER
-    pairs are merged.
+    """Merge candidates one by one; limits: largest standard deviations before and after SURE_AFTER
+    pairs.
     """
     (*merged,), joint = begun
     first, second = candidates
@@ -221,10 +215,9 @@ def _grow(
 def _find_rivals(
     joint: Joint, first: Indices, second: Indices, at: Likelihoods, profile: AssociationProfile
 ) -> Float[np.ndarray, " k"]:
-    """Find the best LLR of each pair's rivals: another partner of its first or second landmark.
+    """Find the best LLR of each pair's rivals, which share one of its landmarks.
 
-    A partner that may be the same object as this one (split in two) is no rival: fragments of one
-    landmark would block each other.
+    A partner that may be a fragment of the same object is no rival.
     """
     rival = np.full(len(first), -np.inf)
     for mine, other in ((first, second), (second, first)):
@@ -248,7 +241,7 @@ def _list_common(landmarks: Indices) -> tuple[Indices, Indices]:
 
 
 class _Assignment(NamedTuple):
-    """The pairs so far, their log weight, and the joint Gaussian given them."""
+    """Pairs so far, their log weight, and the joint Gaussian given them."""
 
     weight: float
     pairs: tuple[Pair, ...]
@@ -261,10 +254,10 @@ def assign_jointly(
     """Merge the pairs on which nearly all of the weight of joint assignments agrees.
 
     A pair needs log odds of `odds` against all assignments without it. If one of these pairs has a
-    standard deviation above `tight`, all of them together need a log-likelihood ratio of
-    `llr_loose`; if it would without pairs that are not accepted, the assignment as a whole needs
-    it. most_sd: largest standard deviation of a pair given those before it: far landmarks that
-    share a heading error are certain given near ones.
+    standard deviation above `tight`, all together need a log-likelihood ratio of `llr_loose`; if it
+    would without pairs that are not accepted, the assignment as a whole needs it. most_sd: largest
+    standard deviation of a pair given those before it, so that far landmarks with a common heading
+    error become certain.
     """
     first, second, sd = gate_pairs(joint, first, second, profile)
     if not (sd <= most_sd).any():
@@ -302,7 +295,7 @@ def _order_landmarks(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
 def _select_partners(
     joint: Joint, first: int, others: list[int], profile: AssociationProfile
 ) -> Indices:
-    """Select the partners of a landmark; of likely fragments of one landmark only the likeliest."""
+    """Select the partners of a landmark, the likeliest of likely fragments."""
     at = evaluate_pairs(joint, np.full(len(others), first), np.array(others), profile)
     distinct: list[int] = []
     for k in np.argsort(-at.llr, kind="stable").tolist():
@@ -329,7 +322,7 @@ def _extend(
 
 
 def _find_fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
-    """Find a landmark's likely fragments, itself included, which are no rivals."""
+    """Find a landmark's likely fragments, with itself."""
     away = core.hypot(*(joint.mean - joint.mean[landmark]).T)
     near = np.flatnonzero((away < profile.same) & ~joint.apart[landmark])
     own = np.full(len(near), landmark)
@@ -343,8 +336,7 @@ def _accept_agreed(
 ) -> list[Pair]:
     """Accept the pairs of the best assignment that the others contain as well, by weight.
 
-    part: the landmarks before any merge. lost: weight of the dropped assignments, relative to the
-    best one's.
+    part: landmarks before any merge. lost: weight of the dropped assignments relative to the best.
     """
     best = beam[0]
     weights = core.exp(np.array([one.weight - best.weight for one in beam]))
@@ -370,10 +362,9 @@ def _is_loose(pairs: list[Pair], profile: AssociationProfile) -> bool:
 
 
 def _evaluate_alone(part: Joint, sure: list[Pair], profile: AssociationProfile) -> list[Pair]:
-    """Evaluate the sure pairs given each other alone; none where one fails its gate then.
+    """Evaluate the sure pairs given each other alone; none if one fails its gate then.
 
-    In its assignment each was evaluated given all pairs before it, and its standard deviation may
-    be small only because of a pair that is not accepted.
+    A pair's standard deviation may be small only because of a pair that is not accepted.
     """
     found = merge_in_order(part, [(pair.first, pair.second) for pair in sure], profile)
     if found is None:

@@ -1,8 +1,8 @@
 """Unnamed landmarks as sets of (submap, local landmark), with the evidence for each merge.
 
 A submap adds each of its unnamed landmarks as a set; association merges sets. A set has the number
-of its smallest member, so its identity lasts, or the name of a named landmark. All of this depends
-only on the order in which submaps are added.
+of its smallest member, which lasts, or the name of a named landmark. All of this depends only on
+the order in which submaps are added.
 """
 
 import hashlib
@@ -24,17 +24,15 @@ from teamslam.team.estimation.association.member_log import (
 )
 from teamslam.team.estimation.contribution import Contribution, Key, Stream, named
 
-OPEN = 2**62
-"""Last sequence number of a side that includes all later submaps."""
-MOST_DECISIONS = 400
-"""Newest decisions that are stored."""
+OPEN = 2**62  # last sequence number of a side that includes all later submaps
+MOST_DECISIONS = 400  # newest decisions that are stored
 
 
 class Decision(NamedTuple):
-    """A closure, or a merge of robots, that was accepted, undone or deferred.
+    """An accepted, undone or deferred closure or merge of robots.
 
-    kind: "closure", "merge", "undone", "waits". about: the robots concerned, in words. Figures as
-    in `verification.Closure`.
+    kind: "closure", "merge", "undone", "waits". about: the robots, in words. Figures as in
+    `verification.Closure`.
     """
 
     stamp_ns: int
@@ -59,9 +57,9 @@ class Verdict(NamedTuple):
 
 
 class Opened(NamedTuple):
-    """An accepted closure: its pairs by their smallest members, and its newer side.
+    """An accepted closure: its pairs by their smallest members.
 
-    newer: the streams of that side, each with its first and last submap on it.
+    newer: streams of its newer side, each with its first and last submap.
     """
 
     decision: Decision
@@ -73,10 +71,9 @@ class Opened(NamedTuple):
 class Landmarks:
     """The sets of unnamed landmarks.
 
-    present: the members of each landmark of the map, by its identity. log: all members, also of
-    dropped landmarks. names: names that an operator has declared to be another one. waits: the last
-    failed attempt of each stream. opened: the closures of the last tick. undone: closures not
-    accepted again.
+    present: members of each landmark of the map, by identity. log: all members, also of dropped
+    landmarks. names: names declared to be another one. waits: last failed attempt of each stream.
+    opened: closures of the last tick. undone: closures not accepted again.
     """
 
     present: Mapping[int, MemberSummary] = field(default_factory=dict)
@@ -104,7 +101,7 @@ class Landmarks:
         return {number: self._resolve_name(id_) for number, id_ in self.log.identities().items()}
 
     def identity(self, member: LocalLandmark) -> int | None:
-        """Look up the number of a member's landmark; None for an unknown member."""
+        """Look up the identity of a member's landmark; None for an unknown member."""
         found = self.log.identity(member)
         return None if found is None else self._resolve_name(found)
 
@@ -144,11 +141,11 @@ class Landmarks:
         return replace(self, present={**self.present, **back}), numbers
 
     def add_decisions(self, *decisions: Decision) -> "Landmarks":
-        """Add decisions, of which the newest are stored."""
+        """Add decisions; the newest are stored."""
         return replace(self, decisions=(*self.decisions, *decisions)[-MOST_DECISIONS:])
 
     def was_undone(self, pairs: Sequence[tuple[int, int]]) -> bool:
-        """Return whether a closure with a third or more of these pairs of identities was undone."""
+        """Return whether a closure with a third or more of these pairs was undone."""
         proposed = {frozenset(pair) for pair in pairs}
         for each in self.undone:
             old = {frozenset((self.identity(one), self.identity(two))) for one, two in each.pairs}

@@ -1,7 +1,7 @@
-"""Append-only log of the members of all unnamed landmarks, in few bytes and shared arrays.
+"""Append-only log of the members of all unnamed landmarks, in shared arrays.
 
-A longer log shares all but its last rows with the log before, so checkpoints store no row twice,
-and the time of a tick depends on its own submaps only.
+A longer log shares all but its last rows with the log before, so checkpoints store no row twice and
+a tick costs the time of its own submaps.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,14 +14,10 @@ from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.shapes import Bool, UInt32
 
-KINDS = ("track", "near", "sweep", "closure", "merge", "verdict")
-"""The steps that merge landmarks."""
-RUN = 64
-"""Submaps of a stream whose rows are stored together."""
-CHUNK = 4096
-"""Given numbers that are stored together."""
-LAST = 11
-"""Last members of a landmark in its summary; all are in the log."""
+KINDS = ("track", "near", "sweep", "closure", "merge", "verdict")  # the steps that merge landmarks
+RUN = 64  # submaps of a stream whose rows are stored together
+CHUNK = 4096  # given numbers that are stored together
+LAST = 11  # last members of a landmark in its summary
 
 Rows = np.ndarray
 """The unnamed landmarks of one submap, ascending by local number, as records of `ROW`."""
@@ -58,7 +54,7 @@ class LocalLandmark(NamedTuple):
 
 
 class MergeRecord(NamedTuple):
-    """The step that merged the set of this number into another one, and its figures.
+    """The step that merged a set into another one, and its figures.
 
     stamp_ns: last end of a submap in the tick.
     """
@@ -72,7 +68,7 @@ class MergeRecord(NamedTuple):
 
 
 class MemberRecord(NamedTuple):
-    """A member of a landmark; tie: the merge by which it lost its own number, if any."""
+    """A member of a landmark; tie: the merge by which it lost its own number."""
 
     name: LocalLandmark
     tie: MergeRecord | None = None
@@ -100,7 +96,7 @@ class MemberLog:
     chunks: tuple[UInt32[np.ndarray, " _"], ...] = ()
 
     def rows(self, stream: Stream, sequence: int) -> Rows:
-        """Return the rows of a submap; none where it has no unnamed landmark or is absent."""
+        """Return the rows of a submap; none if it has no unnamed landmark or is absent."""
         if stream not in self.streams:
             return NO_ROWS
         runs = self.runs[self.streams.index(stream)]
@@ -115,7 +111,7 @@ class MemberLog:
                     yield stream, RUN * k + n, rows
 
     def mark_given(self, numbers: UInt32[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Mark the numbers that a member has had before."""
+        """Mark the numbers that are in the log."""
         found = np.zeros(len(numbers), np.bool_)
         for chunk in self.chunks:
             at = np.minimum(np.searchsorted(chunk, numbers), len(chunk) - 1)
@@ -125,7 +121,7 @@ class MemberLog:
     def add_submap(
         self, stream: Stream, sequence: int, locals_: Sequence[int], numbers: Sequence[int]
     ) -> "MemberLog":
-        """Append the unnamed landmarks of one more submap."""
+        """Append the unnamed landmarks of one submap."""
         rows = np.zeros(len(numbers), ROW)
         rows["local"], rows["number"] = locals_, numbers
         log = self._write(stream, sequence, rows)
@@ -169,7 +165,7 @@ class MemberLog:
         return MemberLog(streams, tuple(runs), self.chunks)
 
     def identity(self, member: LocalLandmark) -> int | None:
-        """Look up the number or the name of a member's landmark; None for an unknown member."""
+        """Look up the number or name of a member's landmark; None for an unknown member."""
         while True:
             rows = self.rows((member.robot, member.incarnation), member.sequence)
             at = int(np.searchsorted(rows["local"], member.local))

@@ -8,18 +8,17 @@ from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.shapes import Float, Int64
 
-UNASSIGNED = -1
-"""No identity, or no landmark."""
+UNASSIGNED = -1  # no identity, or no landmark
 
 
 @dataclass(frozen=True)
 class Scans:
     """The motion of a window and the detections of each of its K keyframes.
 
-    motions: the pose of keyframe k in the frame of keyframe k − 1, of the first in that of the
-    window's start. motion_covariances: of (forward, left, turn), in the tangent space of the
-    motion's end. keyframes: of each of the N detections, ascending. points, covariances: in the
-    robot's frame at their keyframe [m, m²]. names: the identity of each, or UNASSIGNED.
+    motions: pose of keyframe k in the frame of k − 1, of the first in that of the window's start.
+    motion_covariances: of (forward, left, turn), in the tangent space of the motion's end.
+    keyframes: of each of the N detections, ascending. points, covariances: in the robot's frame [m,
+    m²]. names: identity of each, or UNASSIGNED.
     """
 
     motions: Float[np.ndarray, "K 3"]
@@ -40,9 +39,7 @@ def points_of(
     bearings: Float[np.ndarray, " n"],
     variances: Float[np.ndarray, "n 3"],
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Convert ranges and bearings with covariances (rr, rb, bb) to points with theirs, to first
-    order.
-    """
+    """Convert ranges and bearings with covariances (rr, rb, bb) to points, to first order."""
     s, c = core.sin_and_cos(bearings)
     J = np.stack((np.stack((c, -ranges * s), -1), np.stack((s, ranges * c), -1)), -2)
     R = variances[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
@@ -111,7 +108,7 @@ def initialise_landmark(
     at: int,
     end: int,
 ) -> Float[np.ndarray, "2"]:
-    """Initialise a landmark from a detection: return its position, append its covariance to P.
+    """Initialise a landmark from a detection: return its position, write its covariance to P.
 
     P: joint covariance of `end` numbers with the pose at `at`; written in place.
     """

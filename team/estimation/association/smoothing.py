@@ -1,4 +1,4 @@
-"""Smoothing: estimate a window's path and landmarks by Gauss-Newton for a given association."""
+"""Estimate a window's path and landmarks by Gauss-Newton for a given association."""
 
 from dataclasses import dataclass, replace
 
@@ -17,15 +17,13 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 JITTER = np.diag([1e-6, 1e-6, 1e-8])
 """Added to each motion's covariance [m², m², rad²], which may be of rank 2 or zero."""
-ITERATIONS = 6
-"""Most Gauss-Newton steps."""
-SETTLED = 1e-4
-"""Largest entry [m, rad] of a last step: it changes no association."""
+ITERATIONS = 6  # most Gauss-Newton steps
+SETTLED = 1e-4  # largest entry [m, rad] of a last step: it changes no association
 
 
 @dataclass(frozen=True)
 class SmoothedWindow:
-    """Gaussian of K poses and L landmarks in the window's frame; the poses' errors on their right.
+    """Gaussian of K poses and L landmarks in the window's frame; errors of poses on their right.
 
     covariance: of (ξ₁ … ξ_K, landmarks). squared: the cost at the minimum, with `dof` degrees.
     """
@@ -46,7 +44,7 @@ def smooth_window(
     """Minimise Σ ‖Log(motion⁻¹ ∘ before⁻¹ ∘ pose)‖² + Σ ‖point − Rᵀ(landmark − t)‖².
 
     The window starts at zero. landmark_of: by detection, or UNASSIGNED; every landmark has a
-    detection, and one with a single one is at it. Raises LinAlgError without a solution.
+    detection. Raises LinAlgError without a solution.
     """
     counts = np.bincount(landmark_of[landmark_of != UNASSIGNED], minlength=len(landmarks))
     again = counts > 1
@@ -61,7 +59,7 @@ def _add_single(
     landmark_of: Int64[np.ndarray, " N"],
     again: Bool[np.ndarray, " L"],
 ) -> SmoothedWindow:
-    """Add the landmarks of a single detection, of covariance A P Aᵀ + R by the others' P."""
+    """Add the landmarks of a single detection, with covariance A P Aᵀ + R."""
     rows = np.flatnonzero(~np.append(again, True)[landmark_of])
     rows = rows[np.argsort(landmark_of[rows])]
     of, m, n = scans.keyframes[rows], len(rows), len(found.covariance)

@@ -1,8 +1,8 @@
 """Tracking within a window: an extended Kalman filter that matches the best pair first.
 
 EKF-SLAM (Smith, Self and Cheeseman 1990) with detections as points. A slip of the odometry is
-detected where few detections match, and nearly all match after a jump of the robot (one-point
-RANSAC; Ortín and Montiel 2001); it enlarges the covariance of that motion.
+detected where few detections match, but nearly all after a jump of the robot (one-point RANSAC;
+Ortín and Montiel 2001); it enlarges the covariance of that motion.
 """
 
 from typing import NamedTuple
@@ -29,22 +29,16 @@ from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.se2 import adjoint, compose, inverse
 from teamslam.team.shapes import Float, Int64
 
-FEW = 0.5
-"""Share of matched detections in a scan below which a slip is suspected."""
-MOST = 0.7
-"""Least share of the possible pairs that match after an accepted slip."""
-RARE = 1e-3
-"""Probability with which correct pairs exceed the limit of the joint distance."""
-SLIP_TURN = 0.1
-"""Standard deviation of the rotation of a slip [rad]."""
-LEAST_SLIP = 0.02
-"""Least standard deviation of a slip [m, rad]."""
-SLIP_DETECTIONS = 3
-"""Least number of detections in a scan, and of landmarks, to search for a slip."""
+FEW = 0.5  # share of matched detections in a scan below which a slip is suspected
+MOST = 0.7  # least share of the possible pairs that match after an accepted slip
+RARE = 1e-3  # probability with which correct pairs exceed the limit of the joint distance
+SLIP_TURN = 0.1  # standard deviation of the rotation of a slip [rad]
+LEAST_SLIP = 0.02  # least standard deviation of a slip [m, rad]
+SLIP_DETECTIONS = 3  # least number of detections in a scan, and of landmarks, to search for a slip
 
 
 class Slip(NamedTuple):
-    """A slip of about this (forward [m], left [m], turn [rad]) in the odometry up to a keyframe."""
+    """A slip of about (forward [m], left [m], turn [rad]) in the odometry before a keyframe."""
 
     keyframe: int
     by: Float[np.ndarray, "3"]
@@ -61,7 +55,7 @@ class TrackedWindow(NamedTuple):
 
 
 class Tracker:
-    """The state of the filter: the pose, the landmarks so far and their joint covariance."""
+    """State of the filter: pose, landmarks and their joint covariance."""
 
     def __init__(self, settings: AssociationSettings, most: int) -> None:
         self._settings = settings
@@ -72,7 +66,7 @@ class Tracker:
 
     @property
     def landmarks(self) -> Float[np.ndarray, "L 2"]:
-        """The landmarks' positions in the window's frame."""
+        """Landmark positions [m] in the window's frame."""
         return self._points[: len(self.names)]
 
     @property
@@ -82,7 +76,7 @@ class Tracker:
     def predict_pose(
         self, motion: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]
     ) -> None:
-        """Predict the pose over the motion up to the next keyframe."""
+        """Predict the pose at the next keyframe."""
         n = self._size
         Ad = adjoint(inverse(motion))
         self.pose = compose(self.pose, motion)
@@ -95,7 +89,7 @@ class Tracker:
         return predict_landmarks(self.pose, self.landmarks, self._P, 0, 3)
 
     def apply_slip(self, by: Float[np.ndarray, "3"]) -> None:
-        """Apply a slip of about this (forward, left, turn) to the pose, with its uncertainty."""
+        """Move the pose by a slip (forward, left, turn), with its uncertainty."""
         self.pose = compose(self.pose, by)
         self._P[:3, :3] += slip_covariance(by)
 
@@ -124,7 +118,7 @@ class Tracker:
     def _linearise(
         self, landmarks: Int64[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "m 2"]]:
-        """Compute ∂h/∂state for these landmarks, and h."""
+        """Compute ∂h/∂state and h of these landmarks."""
         m = len(landmarks)
         turn = rotation(self.pose[2])
         seen = dense.product(self.landmarks[landmarks] - self.pose[:2], turn)
@@ -137,7 +131,7 @@ class Tracker:
     def add_landmark(
         self, point: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"], name: int
     ) -> int:
-        """Add a new landmark from a detection; return its index."""
+        """Add a landmark from a detection; return its index."""
         index = len(self.names)
         at = initialise_landmark(self.pose, point, covariance, self._P, 0, self._size)
         self._points[index] = at
@@ -180,11 +174,11 @@ class Tracker:
         covariances: Float[np.ndarray, "n 2 2"],
         found: Int64[np.ndarray, " n"],
     ) -> Float[np.ndarray, "3"] | None:
-        """Find the slip (forward, left, turn) that explains most of a scan; None if none does.
+        """Find the slip (forward, left, turn) that explains most of a scan, or None.
 
-        Each pair of a detection and a landmark near it proposes a slip, given a pose wrong by
-        slip_m. A slip must explain more pairs than those `found` without it, and fit better by more
-        than the cost of one misfitting pair.
+        Each pair of a detection and a landmark within slip_m proposes a slip. It must explain more
+        pairs than those `found` without it, and fit better by more than the cost of one misfitting
+        pair.
         """
         gate, reach = self._settings.gate, self._settings.slip_m
         seen, spread = self.predict_landmarks()
@@ -241,9 +235,8 @@ class Tracker:
 
 
 def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance of a motion with a slip of about this (forward, left, turn).
-
-    The slip is its standard deviation, at least LEAST_SLIP.
+    """Return the covariance of a slip (forward, left, turn): diag of its squares, at least
+    LEAST_SLIP².
     """
     metres = max(core.hypot(*slip[:2]), LEAST_SLIP)
     turn = max(abs(float(slip[2])), LEAST_SLIP)
@@ -287,7 +280,9 @@ def _is_slip_suspected(
     covariances: Float[np.ndarray, "n 2 2"],
     reach: float,
 ) -> bool:
-    """Return whether few detections match, some miss a landmark nearby, or the pairs do not fit."""
+    """Return whether few detections match, one near a landmark is unmatched, or the pairs do not
+    fit.
+    """
     known = np.nonzero(found != UNASSIGNED)[0]
     if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
         return False

@@ -1,4 +1,4 @@
-"""The tests of a closure, at its proposal and during its audit, and of a map's landmarks."""
+"""Tests of a closure, at its proposal and during its audit, and of a map's landmarks."""
 
 from collections.abc import Collection, Mapping
 from typing import NamedTuple
@@ -11,17 +11,16 @@ from teamslam.team.estimation.association.gating import Indices, Pair, evaluate_
 from teamslam.team.estimation.association.island_view import IslandView
 from teamslam.team.shapes import Float
 
-WIDE = 3.0
-"""Radius around a closure's places that an audit considers, in spacings."""
+WIDE = 3.0  # radius around a closure's places that an audit considers, in spacings
 MOST_REPEATED = 40
 """Largest number of landmarks that another place is expected to repeat (36 lamps of a corridor),
-which limits the context that tells a place from its repetitions.
+which limits the required context.
 """
 NO_CONTEXT = (
     "too few others to exclude a like place. Give starts, tags on some landmarks or a verdict, "
     "or if all robots are in one place central.association.context = 0"
 )
-"""Behind a closure without context: its reason and remedy."""
+"""Reason and remedy of a closure without context."""
 
 
 class Closure(NamedTuple):
@@ -31,7 +30,7 @@ class Closure(NamedTuple):
     of landmarks of one side that the other side viewed without having one. rival_pairs, rival_llr:
     of the best other alignment. share: matched share of the landmarks near the matched places, of
     the side with fewer. sd: largest standard deviation [m] of a pair's difference. motion: (x, y,
-    θ) that maps the patch onto the target; zero within one map.
+    θ) from patch to target; zero within one map.
     """
 
     pairs: tuple[Pair, ...]
@@ -48,7 +47,7 @@ class Closure(NamedTuple):
 class ClosureTests(NamedTuple):
     """Least pairs, evidence, and context of a closure.
 
-    context: landmarks outside the matched place, relative to the pairs, of the `known` ones of both
+    context: least landmarks outside the matched place over the pairs, of the `known` ones of both
     sides (two islands only; 0: not tested).
     """
 
@@ -59,7 +58,7 @@ class ClosureTests(NamedTuple):
 
 
 def find_failed_test(closure: Closure, profile: AssociationProfile, tests: ClosureTests) -> str:
-    """Find the first test that a closure fails, in words; empty if it passes all."""
+    """Return the first test that a closure fails, in words; empty if it passes all."""
     pairs = len(closure.pairs)
     evidence = closure.llr - profile.absent * closure.absent
     if pairs < tests.pairs:
@@ -102,7 +101,7 @@ def matched_share(
 ) -> float:
     """Compute matched places over the number of points near them, of the side with fewer.
 
-    Near: within the median distance between neighbouring places of a matched place.
+    Near: within the median distance between neighbouring places.
     """
     if len(places) < 2:
         return 0.0
@@ -117,11 +116,11 @@ def overlap_share(
     places: Float[np.ndarray, "k 2"],
     profile: AssociationProfile,
 ) -> float:
-    """Compute matched places over the number of points where both sides viewed, of the side with
+    """Compute matched places over the number of points in view of both sides, of the side with
     fewer.
 
-    one, two: all points of either side. The area is within WIDE spacings of a matched place and
-    within one spacing of a point of the other side.
+    one, two: all points of either side. A point counts within WIDE spacings of a matched place and
+    one spacing of a point of the other side.
     """
     if len(places) < 2 or not len(one) or not len(two):
         return 0.0
@@ -157,13 +156,11 @@ def nearest_distance(
 def find_possible_duplicates(
     view: IslandView, ids: Collection[int], parts: Mapping[int, int]
 ) -> dict[int, int]:
-    """Map each of these landmarks that may be one with another of them to the likeliest, which
-    stays.
+    """Map each landmark that may be one with another of them to the likeliest, which stays.
 
-    They are within the gate, with the evidence of a pair that is merged, or in such a density that
-    no pair would have it, or in two `parts` that no common landmark ties: their pairs have one
-    error, which no single pair decides. The landmark with the most certain position stays, by the
-    area of its covariance's ellipse.
+    Such a pair is within the gate and has the evidence of a merge, lies in a density in which no
+    pair has it, or joins two `parts` that no common landmark ties, whose pairs have one common
+    error. The landmark of the smallest covariance ellipse stays.
     """
     profile, joint = view.profile, view.joint
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)

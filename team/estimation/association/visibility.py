@@ -1,7 +1,7 @@
 """Negative evidence: landmarks of one side that the other side viewed without observing them.
 
-The landmarks that one keyframe observed together span a polygon inside its convex field of view; a
-landmark of the other side in this polygon should have been observed.
+The landmarks that one keyframe observed span a polygon inside its convex field of view, in which it
+should have observed every landmark.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,17 +13,16 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 OVERLOOKED = 0.4
 """Upper bound of the probability that a window which observes a landmark misses one beside it."""
-WELL_KNOWN = 4
-"""Number of submaps from which a landmark shows that those beside it were missed."""
+WELL_KNOWN = 4  # least submaps of a landmark that shows the misses of those beside it
 LEAST_OVERLOOKED = 0.1
 """Lower bound of the same probability: some landmarks are visible from one side only."""
 
 Views = Int64[np.ndarray, "_ _"]
-"""For each keyframe the landmarks that it observed together; rows are padded with −1."""
+"""Landmarks that each keyframe observed together; rows are padded with −1."""
 
 
 def pad_views(views: Iterable[Int64[np.ndarray, " _"]]) -> Views:
-    """Arrange lists of landmarks as the rows of one array."""
+    """Arrange lists of landmarks as the rows of one array, padded with −1."""
     each = list(views)
     out = np.full((len(each), max(map(len, each), default=0)), -1)
     for row, view in zip(out, each, strict=True):
@@ -45,7 +44,7 @@ def mark_visible(
 ) -> Bool[np.ndarray, " n"]:
     """Mark the points in the convex hull of any one view's landmarks, at their positions `own`.
 
-    A point lies in a hull when the directions to the hull's points leave no gap of half a turn.
+    In a hull the directions to its points leave no gap of half a turn.
     """
     inside = np.zeros(len(points), np.bool_)
     if not len(points) or not views.size:
@@ -68,9 +67,9 @@ def mark_visible(
 def miss_probabilities(
     points: Float[np.ndarray, "n 2"], seen_by: Sequence[Int64[np.ndarray, " _"]], radius: float
 ) -> Float[np.ndarray, " n"]:
-    """Compute the probability that all windows that saw each landmark missed another one beside it.
+    """Compute the probability that all windows with a landmark missed another one beside it.
 
-    seen_by: the landmarks of each window. radius [m]: of a place around a landmark.
+    seen_by: landmarks of each window. radius [m]: of a place around a landmark.
     """
     x, y = points.T
     near = core.hypot(x[:, None] - x, y[:, None] - y) < radius
@@ -85,8 +84,8 @@ def miss_probabilities(
 def mark_missed(sees: Bool[np.ndarray, "K n"]) -> Bool[np.ndarray, " n"]:
     """Mark the landmarks that later submaps miss.
 
-    A landmark of n < WELL_KNOWN submaps, if each well-known landmark beside it in its last one is
-    in WELL_KNOWN n submaps since. sees: by submap, in the order of time.
+    A landmark of n < WELL_KNOWN submaps is missed if each well-known one beside it in its last
+    submap is in WELL_KNOWN n submaps since. sees: by submap, in the order of time.
     """
     counts = sees.sum(axis=0)
     beside = sees & (counts >= WELL_KNOWN)

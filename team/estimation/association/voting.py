@@ -1,8 +1,8 @@
-"""Alignments of two sets of points from their shapes alone, by votes of pairs of points.
+"""Align two sets of points by their shapes alone, by votes of pairs of points.
 
 Two points of one side at the distance of two points of the other propose a rigid motion (a Hough
-transform over SE(2)); motions with many votes are refined by nearest neighbours. All places are
-searched, so that every rival is found.
+transform over SE(2)); nearest neighbours refine motions with many votes. All places are searched,
+so that every rival is found.
 """
 
 from collections.abc import Sequence
@@ -20,26 +20,22 @@ from teamslam.team.estimation.association.classes import (
 )
 from teamslam.team.shapes import Bool, Float, Int64
 
-MOST_BINS = 60
-"""Most refined motions, those with the most votes."""
+MOST_BINS = 60  # most refined motions, those with the most votes
 ANGLE_BIN = np.radians(6.0)
 """Width of a bin of rotations [rad]; bins of translations are three tolerances wide."""
-REFINEMENTS = 4
-"""Steps of nearest neighbours."""
+REFINEMENTS = 4  # steps of nearest neighbours
 MOST_HYPOTHESES = 100_000
 """Most pairs of baselines that vote: the longest, which determine the heading best."""
-MOST_OF_PART = 16
-"""Motions of a part that are refined on all points."""
-MOST_COUNTED = 4_000_000
-"""Most cells for which votes are counted cell by cell."""
+MOST_OF_PART = 16  # motions of a part that are refined on all points
+MOST_COUNTED = 4_000_000  # most cells whose votes are counted cell by cell
 WIDER = 1.01
-"""Half of the strip in which the points within reach are searched, in reaches: for rounding."""
-MOST_DISTANCES = 2_000_000
-"""Most distances between points in memory at once."""
+"""Half width of the strip searched for points within reach, in reaches, with a margin for rounding.
+"""
+MOST_DISTANCES = 2_000_000  # most distances between points in memory at once
 
 
 class PointSet(NamedTuple):
-    """Points of one side [m], and the standard deviation [m] of each relative to its neighbours.
+    """Points of one side [m], with the standard deviation [m] of each relative to its neighbours.
 
     classes: evidence of their classes; points of contradicting ones do not match.
     """
@@ -77,8 +73,7 @@ def propose_alignments(
     """Propose distinct rigid motions of a onto b, by decreasing number of matched points.
 
     tolerance: largest distance of matched points [m]. longest: largest distance [m] of two points
-    that vote together. parts: subsets of a that vote by themselves as well, for a small shared
-    place.
+    that vote together. parts: subsets of a that also vote by themselves, for a small common place.
     """
     if len(a.mean) < 2 or len(b.mean) < 2:
         return []
@@ -103,7 +98,7 @@ def propose_alignments(
 
 
 def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
-    """Drop variants of votes with more matched points; sort by that number, descending."""
+    """Sort votes by decreasing number of matched points; drop variants of votes with more."""
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
     paired = np.full((len(found), points), -1)
@@ -214,7 +209,7 @@ def _refine(
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """Refine the motions by nearest neighbours; drop those that no two points confirm."""
+    """Refine the motions by nearest neighbours; drop those without two confirming points."""
     local, fits = a.mean - centre, _compatible(a, b)
     size = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
     votes = []
@@ -244,9 +239,9 @@ def _find_neighbours(
     reach: float,
     fits: Bool[np.ndarray, "n m"] | None,
 ) -> tuple[Int64[np.ndarray, "B n"], Bool[np.ndarray, "B n"]]:
-    """Find the nearest point of b within reach of each point, else 0; mark those mutually nearest.
+    """Find the nearest point of b within reach of each point, else 0; mark mutually nearest ones.
 
-    fits: the pairs of compatible classes; None: all.
+    fits: pairs of compatible classes; None: all.
     """
     n, m = len(a), len(b)
     s, c = core.sin_and_cos(motions[:, 2:])

@@ -42,7 +42,7 @@ FEW_LANDMARKS = 6  # most landmarks with which a chain may fold wrongly at an un
 RIVAL = "another map fits about as well"
 MISFIT = "the map does not fit its submaps"
 """First words of the warnings about another minimum, and about the cost."""
-WIDE = 30.0  # cauchy's scale at which the annealed start begins
+WIDE = 30.0  # Cauchy's scale at which the annealed start begins
 
 
 class Minimum(NamedTuple):
