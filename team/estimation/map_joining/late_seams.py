@@ -92,19 +92,12 @@ def find_late_seam(island: Island) -> Seam | None:
     if best is None:
         return None
     evidence, stream, places = best
-    first = sights.submaps[min(each.before for each in places)].contribution
-    last = sights.submaps[max(each.after for each in places)]
-    start_ns = _begin_ns(sights, stream, last.contribution.sequence)
-    return Seam(
-        stream, first.sequence, last.contribution.sequence, first.end_ns, start_ns, evidence
+    rows, after = _rows_of(sights, stream), max(each.after for each in places)
+    first, previous, last = (
+        sights.submaps[row].contribution
+        for row in (min(each.before for each in places), rows[rows.index(after) - 1], after)
     )
-
-
-def _begin_ns(sights: _Sights, stream: Stream, sequence: int) -> int:
-    of_stream = (each.contribution for each in sights.submaps)
-    return next(
-        each.end_ns for each in of_stream if each.stream == stream and each.sequence == sequence - 1
-    )
+    return Seam(stream, first.sequence, last.sequence, first.end_ns, previous.end_ns, evidence)
 
 
 def _sights_of(island: Island) -> _Sights:
