@@ -29,8 +29,7 @@ RANGE_POWER: Mapping[Bias, int] = MappingProxyType(
     }
 )
 """Power of a landmark's range with which each bias moves it; −1: it moves none."""
-UNIX_S = 1e9
-"""Team times from here on [s] are Unix times (2001)."""
+UNIX_S = 1e9  # team times from here on [s] are Unix times (2001)
 
 
 def is_map(stream: Stream) -> bool:
@@ -39,11 +38,11 @@ def is_map(stream: Stream) -> bool:
 
 
 SURVEYED: Stream = (SURVEY, 0)
-"""Stream of the surveyed landmarks, a saved map with a known start; its frame is absolute."""
+"""Stream of the surveyed landmarks, a saved map with a known start in an absolute frame."""
 
 
 STATION: Stream = (GNSS, 0)
-"""Stream of the station from which fixes are measured: an exact pose without landmarks."""
+"""Stream of the station that measures fixes: an exact pose without landmarks."""
 
 
 def is_absolute(stream: Stream) -> bool:
@@ -51,8 +50,7 @@ def is_absolute(stream: Stream) -> bool:
     return stream in (SURVEYED, STATION)
 
 
-PART = 1 << 64
-"""Step of the incarnation number from which a part of a cut stream is numbered."""
+PART = 1 << 64  # step of the incarnation number from which a part of a cut stream is numbered
 
 
 def part_of(stream: Stream, first: int) -> Stream:

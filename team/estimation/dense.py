@@ -1,7 +1,6 @@
 """Products and solutions of dense matrices with the same bits on every processor.
 
-Sums run in index order; a BLAS orders them by processor. Further leading axes are stacks, as in
-NumPy.
+Sums run in index order. Further leading axes are stacks, as in NumPy.
 """
 
 from teamslam.team.core import (

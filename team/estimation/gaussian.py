@@ -1,4 +1,4 @@
-"""Gaussians as (mean, covariance), and the checks and packings of covariance matrices."""
+"""Gaussians as (mean, covariance), with checks and packings of covariance matrices."""
 
 import math
 from typing import NamedTuple
@@ -53,7 +53,7 @@ UNSOLVABLE = (NotDeterminedError, NotACovarianceError, np.linalg.LinAlgError)
 
 
 class CoreErrors:
-    """A context that raises the core's errors as NotACovarianceError."""
+    """Context that raises the core's errors as NotACovarianceError."""
 
     def __enter__(self) -> None:
         """Do nothing."""
@@ -81,12 +81,12 @@ FAULTS = ("", "not finite", "not positive definite", "not symmetric")
 
 
 def deviation(variance: float) -> float:
-    """Standard deviation; 0 if rounding has made the variance negative."""
+    """Return the standard deviation; 0 if rounding made the variance negative."""
     return math.sqrt(variance) if variance > 0.0 else 0.0
 
 
 def information(covariance: Matrix, what: str) -> Matrix:
-    """Compute P⁻¹ = L⁻ᵀL⁻¹ from the Cholesky factor of P, exactly symmetric."""
+    """Compute P⁻¹ = L⁻ᵀL⁻¹, exactly symmetric, from the Cholesky factor of P."""
     if not len(covariance):
         return np.zeros((0, 0))
     return dense.inverse_of_factored(cholesky_factor(covariance, what))

@@ -1,4 +1,4 @@
-"""A teammate seen from a pose node: a range-bearing factor between two robots' pose nodes.
+"""A teammate observed from a pose node: a range-bearing factor between two robots' pose nodes.
 
 A fix (GNSS) is one, too: the station, an exact pose far away, measures the antenna. The observer's
 odometry T ∘ Exp(xi), xi ~ N(0, C), carries the point to the pose node: p' = T Exp(xi) p to an
@@ -23,7 +23,7 @@ from teamslam.team.estimation.se2 import Pose, inverse, transformed, wrapped
 from teamslam.team.shapes import Float
 
 STATION_POSE = np.array([0.0, -1e5, 0.0])
-"""Pose of the station in the survey's frame: so far away that (range, bearing) is linear."""
+"""Pose of the station in the survey's frame, so far away that (range, bearing) is linear."""
 BASE = np.zeros(2)
 SightingKey: TypeAlias = tuple[int, str, int, str]
 """(stamp, robot, incarnation, teammate): place in the canonical order."""
@@ -34,7 +34,7 @@ class InterRobotFactor:
     """An inter-robot measurement from the pose node at stamp_ns of submap `sequence`.
 
     measurement: (range [m], bearing [rad]) of the teammate's node at the same stamp. covariance:
-    [m², m·rad, rad²]. A fix has the teammate GNSS, from the station; point: the antenna in the
+    [m², m·rad, rad²]. A fix, from the station, has the teammate GNSS; point: the antenna in the
     frame of the robot's node [m].
     """
 
@@ -54,7 +54,7 @@ class InterRobotFactor:
 
     @property
     def stream(self) -> Stream:
-        """(robot, incarnation) of the observer, or of the robot of a fix."""
+        """(robot, incarnation) of the observer, or of a fix's robot."""
         return (self.robot, self.incarnation)
 
     @property
@@ -139,9 +139,9 @@ def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
 def reduced(
     carried: Sequence[CarriedPoint],
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
-    """Reduce several measurements from one node to one (range, bearing).
+    """Reduce several measurements from one node to their median (range, bearing).
 
-    Their median, with the mean covariance, since a camera repeats its error.
+    The covariance is the mean, since a camera repeats its error.
     """
     ranges = [max(core.hypot(*each.point), NEAREST_M) for each in carried]
     bearings = [core.atan2(each.point[1], each.point[0]) for each in carried]

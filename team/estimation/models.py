@@ -1,7 +1,7 @@
 """The motion of one interval as a Gaussian on SE(2), and the range-bearing sensor.
 
-Thrun, Burgard and Fox 2005, sections 5.3 and 6.6; the motion noise is in the tangent space of the
-motion's end, so motions compose.
+Thrun, Burgard and Fox 2005, sections 5.3 and 6.6, but with motion noise in the tangent space of the
+motion's end, so that motions compose.
 """
 
 import math
@@ -34,8 +34,7 @@ __all__ = [
 class Increment(msgspec.Struct, frozen=True, gc=False):
     """b_from_b': truth = mean ∘ Exp(xi), xi ~ N(0, covariance) in (forward, left, turn).
 
-    mean: (x [m], y [m], theta [rad]). covariance: positive semi-definite, of any rank, [m², m·rad,
-    rad²].
+    mean: (x [m], y [m], theta [rad]). covariance: positive semi-definite, [m², m·rad, rad²].
     """
 
     mean: Pose
@@ -87,9 +86,7 @@ def _densities(noise: MotionNoise) -> tuple[float, float, float]:
 def increment_of(
     motion: MotionModel, duration_s: float, forward: float, yaw_rate: float
 ) -> Increment:
-    """Compute the motion of speeds [m/s, rad/s] held for `duration_s`
-    (`core.MotionModel.increment`).
-    """
+    """Compute the motion of speeds [m/s, rad/s] held for `duration_s`."""
     return Increment(*model_of(motion).increment(duration_s, forward, yaw_rate))
 
 
@@ -132,13 +129,13 @@ def corrected(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Apply the calibration: ((r − range_offset)/range_scale, b − bearing_offset − lens(b)).
 
-    A depth is divided by cos(b − optical_axis), too; NaN where below OFF_AXIS.
+    A depth is also divided by cos(b − optical_axis); NaN where below OFF_AXIS.
     """
     return scanned(sensor, ranges, bearings)[1:]
 
 
 class Noise(NamedTuple):
-    """Variances of a measurement, and the white share of each, the rest being constant."""
+    """Variances of a measurement, and the white share of each; the rest is constant."""
 
     range_variance: float
     range_per_m2: float

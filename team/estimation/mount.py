@@ -1,7 +1,7 @@
 """A sensor mounted off the origin of the robot's base.
 
-Within a window poses and motions are the sensor's: for a motion T of the base, m⁻¹ ∘ T ∘ m with the
-sensor at m; the base's is m ∘ S ∘ m⁻¹.
+Within a window poses and motions are the sensor's: S = m⁻¹ ∘ T ∘ m for a motion T of the base, with
+the sensor at m.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Odometry of a robot as the core takes it, and the bounds of its stream."""
+"""Odometry of a robot in the core's form, and the bounds of its stream."""
 
 import math
 from typing import NamedTuple
@@ -15,8 +15,7 @@ from teamslam.team.shapes import Float
 __all__ = ["LONGEST_NS", "Moved", "OdometryInterval", "moved", "nanoseconds", "segmenter_of",
            "steered", "stream_bounds"]  # fmt: skip
 
-LONGEST_NS = 2**62
-"""No two stamps are as far apart."""
+LONGEST_NS = 2**62  # bound of the difference of two stamps
 _BOUNDS = Bounds()
 
 
@@ -28,7 +27,7 @@ def nanoseconds(seconds: float) -> int:
 class Moved(NamedTuple):
     """A measured motion Exp(twist), twist = (forward [m], left [m], turn [rad]).
 
-    covariance: reported, of the error in the tangent space of the motion's end.
+    covariance: as reported, in the tangent space of the motion's end.
     """
 
     twist: Pose
@@ -71,8 +70,8 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
     """Compute (forward [m/s], yaw rate [rad/s]) of a car from wheel and steering encoders.
 
     With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at (0,
-    h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). NaN where the model is
-    not a car's, or the wheel is at the centre of the turn.
+    h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). NaN for models other
+    than a car's, or a wheel at the centre of the turn.
     """
     if motion.kind != "ackermann" or motion.wheel_base is None:
         return math.nan, math.nan
@@ -85,5 +84,5 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
 
 
 def moved(increment: Pose, covariance: Float[np.ndarray, "3 3"] | None) -> Moved:
-    """Convert a motion, given by its end in the frame of its start, |theta| ≤ π."""
+    """Convert a motion, the end in the frame of the start with |theta| ≤ π."""
     return Moved(logarithm(increment), covariance)

@@ -1,4 +1,4 @@
-"""Check values against physical bounds; a refusal is a value with its reason.
+"""Check values against physical bounds; return the reason of a refusal.
 
 The wire checks a message's form, this module its plausibility for a robot on the ground.
 """
@@ -20,7 +20,7 @@ Matrix = Float[np.ndarray, "n n"]
 
 
 def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
-    """Return the reason to refuse a submap, if any."""
+    """Return the reason to refuse a submap, or None."""
     if len(local.ids) > bounds.submap_landmarks:
         return f"{len(local.ids)} landmarks, {bounds.submap_landmarks} at most"
     angles = _angles_of(local)
@@ -34,8 +34,9 @@ def submap_beyond(local: LocalMap, bounds: Bounds) -> str | None:
 
 
 def with_least_spread(local: LocalMap, least: tuple[float, float]) -> LocalMap:
-    """Raise the submap's covariance P to P + F where P − F is not positive definite, F =
-    diag(least²) for coordinates [m] and headings [rad].
+    """Raise the submap's covariance P to P + F unless P − F is positive definite.
+
+    F = diag(least²) for coordinates [m] and headings [rad].
     """
     angles = _angles_of(local)
     sigmas = np.where(angles, least[1], least[0])
@@ -55,7 +56,7 @@ def _angles_of(local: LocalMap) -> Bool[np.ndarray, " n"]:
 
 
 def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
-    """Return the reason to refuse an inter-robot measurement, if any."""
+    """Return the reason to refuse an inter-robot measurement, or None."""
     if sighting.is_fix:
         distance_m = sighting.measurement[:1]
         why = _far(distance_m, bounds.coordinate_m, "of the station")
@@ -68,7 +69,7 @@ def sighting_beyond(sighting: InterRobotFactor, bounds: Bounds) -> str | None:
 
 
 def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
-    """Return the reason to refuse an initial pose, if any."""
+    """Return the reason to refuse an initial pose, or None."""
     if abs(start.pose[2]) > 2.0 * np.pi:
         return "a heading beyond a full turn"
     why = _far(start.pose[:2], bounds.coordinate_m, "of the origin")
@@ -78,7 +79,7 @@ def start_beyond(start: InitialPoseFactor, bounds: Bounds) -> str | None:
 
 
 def prior_beyond(mean: Values, covariance: Matrix, bounds: Bounds) -> str | None:
-    """Return the reason to refuse a prior (x, y, θ, x₁, y₁, …).
+    """Return the reason to refuse a prior (x, y, θ, x₁, y₁, …), or None.
 
     A variance of zero is a known constant; many submaps allow any small one.
     """

@@ -1,4 +1,4 @@
-"""Random numbers keyed by their use: any submap can be computed alone."""
+"""Random numbers keyed by their use, so that any submap can be computed alone."""
 
 import hashlib
 
@@ -10,7 +10,7 @@ from teamslam.team import core
 def random_numbers(seed: int, robot: str, incarnation: int, sequence: int) -> core.Random:
     """Make the counter-based random numbers (Philox 4x64) of one window.
 
-    The key is the BLAKE2b digest of (seed, robot, incarnation, sequence): windows are independent.
+    The key is the BLAKE2b digest of (seed, robot, incarnation, sequence).
     """
     return core.Random(_key(seed, robot, incarnation, sequence))
 

@@ -1,6 +1,6 @@
 """Scans of landmarks, each measurement with its own covariance or the sensor's.
 
-`own` has no rows where no measurement has a covariance, else a row (rr [m²], rb [m·rad], bb [rad²],
+`own` has no rows if no measurement has a covariance, else a row (rr [m²], rb [m·rad], bb [rad²],
 form) for each. POLAR: of range and bearing. POINT: of a point in the sensor's frame, to first
 order: diag(1, 1/r) S diag(1, 1/r), S along and across the measured bearing. SENSOR: the sensor's
 noise, at the predicted range.
@@ -27,7 +27,7 @@ def unclaimed(count: int) -> Own:
 def variances(
     ranges: Float[np.ndarray, " n"], own: Own, sensor: Sensor
 ) -> Float[np.ndarray, "n 3"]:
-    """(rr, rb, bb) of each measurement: claimed, or the sensor's at its range."""
+    """Return (rr, rb, bb) of each measurement: claimed, or the sensor's at its range."""
     of_sensor = np.column_stack(
         (
             core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * ranges),

@@ -486,7 +486,6 @@ def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
 
 
 def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:
-    """Make a patch's side, with parts of its last submaps and the halves of a large patch."""
     parts = []
     for first in range(len(submaps)):
         part = join_indices([])
@@ -501,7 +500,6 @@ def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Sid
 
 
 def _halve(points: Float[np.ndarray, "n 2"], part: Indices) -> list[Indices]:
-    """Halve a part across its longer side down to fewer than 2 PART points."""
     if len(part) < 2 * PART:
         return [part]
     own = points[part]

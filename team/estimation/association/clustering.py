@@ -132,10 +132,7 @@ def _associate_again(
     window: SmoothedWindow,
     settings: AssociationSettings,
 ) -> tuple[Int64[np.ndarray, " N"], Int64[np.ndarray, " L"], Float[np.ndarray, "L 2"]]:
-    """Associate every scan with all landmarks of the window, from the smoothed path.
-
-    A detection without a match becomes a landmark.
-    """
+    """Associate every scan with all landmarks, from the smoothed path; the rest become new ones."""
     k, n = len(window.poses), len(window.covariance)
     most = n + 2 * len(scans.points)
     P = np.zeros((most, most))

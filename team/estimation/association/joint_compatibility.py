@@ -295,7 +295,6 @@ def _order_landmarks(first: Indices, sd: Float[np.ndarray, " k"]) -> list[int]:
 def _select_partners(
     joint: Joint, first: int, others: list[int], profile: AssociationProfile
 ) -> Indices:
-    """Select the partners of a landmark, the likeliest of likely fragments."""
     at = evaluate_pairs(joint, np.full(len(others), first), np.array(others), profile)
     distinct: list[int] = []
     for k in np.argsort(-at.llr, kind="stable").tolist():
@@ -307,7 +306,7 @@ def _select_partners(
 def _extend(
     one: _Assignment, first: int, others: Indices, profile: AssociationProfile, most_sd: float
 ) -> list[_Assignment]:
-    """Extend an assignment by one landmark: as a new one, and as each partner that fits."""
+    """Extend an assignment by one landmark: unmatched, and with each partner that fits."""
     found = [one]
     others = others[~one.joint.apart[first, others]]
     if not len(others):
@@ -322,7 +321,6 @@ def _extend(
 
 
 def _find_fragments(joint: Joint, landmark: int, profile: AssociationProfile) -> set[int]:
-    """Find a landmark's likely fragments, with itself."""
     away = core.hypot(*(joint.mean - joint.mean[landmark]).T)
     near = np.flatnonzero((away < profile.same) & ~joint.apart[landmark])
     own = np.full(len(near), landmark)
@@ -336,7 +334,7 @@ def _accept_agreed(
 ) -> list[Pair]:
     """Accept the pairs of the best assignment that the others contain as well, by weight.
 
-    part: landmarks before any merge. lost: weight of the dropped assignments relative to the best.
+    part: landmarks before any merge. lost: relative weight of the dropped assignments.
     """
     best = beam[0]
     weights = core.exp(np.array([one.weight - best.weight for one in beam]))

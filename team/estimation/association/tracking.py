@@ -118,7 +118,6 @@ class Tracker:
     def _linearise(
         self, landmarks: Int64[np.ndarray, " m"]
     ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "m 2"]]:
-        """Compute ∂h/∂state and h of these landmarks."""
         m = len(landmarks)
         turn = rotation(self.pose[2])
         seen = dense.product(self.landmarks[landmarks] - self.pose[:2], turn)
@@ -280,9 +279,6 @@ def _is_slip_suspected(
     covariances: Float[np.ndarray, "n 2 2"],
     reach: float,
 ) -> bool:
-    """Return whether few detections match, one near a landmark is unmatched, or the pairs do not
-    fit.
-    """
     known = np.nonzero(found != UNASSIGNED)[0]
     if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
         return False

@@ -193,7 +193,6 @@ def _find_peaks(motions: Float[np.ndarray, "v 3"], cell: float) -> list[Float[np
 def _rank_codes(
     codes: Int64[np.ndarray, " v"], beyond: int
 ) -> tuple[Int64[np.ndarray, " v"], Int64[np.ndarray, " _"]]:
-    """Rank each code among the distinct ones, and count these; all codes are below `beyond`."""
     if beyond > MOST_COUNTED:
         _, of, counts = np.unique(codes, return_inverse=True, return_counts=True)
         return of, counts
@@ -209,7 +208,6 @@ def _refine(
     motions: Float[np.ndarray, "B 3"],
     tolerance: float,
 ) -> list[Vote]:
-    """Refine the motions by nearest neighbours; drop those without two confirming points."""
     local, fits = a.mean - centre, _compatible(a, b)
     size = max(1, MOST_DISTANCES // (len(a.mean) * len(b.mean)))
     votes = []

@@ -1,4 +1,4 @@
-"""FastSLAM with known data association: particles over paths, an EKF for each landmark of each.
+"""FastSLAM with known data association: particles over paths, each with an EKF per landmark.
 
 p(path, landmarks | z) = p(path | z) Π p(landmark | path, z). Montemerlo 2003; Thrun et al. 2005,
 ch. 13.
@@ -40,16 +40,15 @@ Arrays = tuple[
     Float[np.ndarray, "M L 2"],
     Float[np.ndarray, "M L 3"],
 ]
-"""The fields of `Particles`, in their order."""
+"""Fields of `Particles`."""
 
 
 @dataclass(frozen=True)
 class Particles:
-    """M weighted poses, each with its own estimate of the L landmarks seen so far.
+    """M weighted poses, each with its own estimate of L landmarks.
 
-    poses: (x [m], y [m], theta [rad]) in the frame of the window's start. log_weights: normalised,
-    Σ exp = 1. ids: in order of first sight. means: [m]; covariances: (xx, xy, yy) given the
-    particle's path [m²].
+    poses: (x [m], y [m], theta [rad]) in the frame of the window's start. log_weights: Σ exp = 1.
+    ids: in order of first observation. means: [m]; covariances: (xx, xy, yy) given the path [m²].
     """
 
     poses: Float[np.ndarray, "M 3"]
@@ -60,14 +59,14 @@ class Particles:
 
     @property
     def arrays(self) -> Arrays:
-        """The fields, as the core takes them."""
+        """Fields in the order of the core's arguments."""
         return self.poses, self.log_weights, self.ids, self.means, self.covariances
 
 
 class StepInfo(msgspec.Struct, frozen=True, gc=False):
     """Statistics of one step.
 
-    effective_sample_size: 1/Σ w² after the step, in [1, M]. parents: the origin of each particle if
+    effective_sample_size: 1/Σ w² after the step, in [1, M]. parents: origin of each particle if
     resampled. log_evidence: log p(z | earlier z); 0 without a re-observation.
     """
 
@@ -77,7 +76,7 @@ class StepInfo(msgspec.Struct, frozen=True, gc=False):
 
 
 def at_poses(poses: Float[np.ndarray, "M 3"]) -> Particles:
-    """Equal particles at these poses that know no landmark."""
+    """Make equal particles at these poses, without landmarks."""
     count = len(poses)
     return Particles(
         poses=poses,
@@ -115,12 +114,12 @@ def propagated_and_updated(
     generator: "np.random.Generator",
     own: Own | None = None,
 ) -> tuple[Particles, StepInfo]:
-    """Resample if the particles are thin, move, then take the measurements.
+    """Resample if the particles are thin, move them, then update them by the measurements.
 
-    Resampling, below an effective sample size of `resample_below`·M, comes first: the particles of
-    a window's last step keep their weights. ranges [m] and bearings [rad] are calibrated, own their
-    covariances (`teamslam.team.estimation.scans`); an id may occur twice. Draws one uniform number
-    if it resamples, and M × 3 normal ones. Raises NotACovarianceError.
+    Resampling, below an effective sample size of `resample_below`·M, comes first, so the last step
+    of a window keeps its weights. ranges [m] and bearings [rad] are calibrated; own: their
+    covariances (`teamslam.team.estimation.scans`); an id may occur twice. Draws M × 3 normal
+    numbers, and one uniform one if it resamples. Raises NotACovarianceError.
     """
     parents = None
     if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
@@ -143,7 +142,7 @@ def filter_step(
     *,
     own: Own | None = None,
 ) -> tuple[Particles, float]:
-    """As `propagated_and_updated` without resampling; returns also the log evidence."""
+    """As `propagated_and_updated` without resampling; return also the log evidence."""
     noises = unclaimed(len(ids)) if own is None else own
     normals = generator.standard_normal((len(particles.poses), 3))
     with CoreErrors():

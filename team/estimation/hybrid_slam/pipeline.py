@@ -1,19 +1,18 @@
-"""Hybrid-SLAM on one robot's measurements: Brooks and Bailey 2009, HybridSLAM.
+"""Hybrid-SLAM on one robot's measurements (Brooks and Bailey 2009, HybridSLAM).
 
-    a measurement comes in                        observe, sight, drive
-    particles move and weigh                      advance (OpenWindow.advance)
+    a measurement arrives                         observe, sight, drive
+    particles move and are weighed                advance (OpenWindow.advance)
     the window closes                             _is_full, _close
     landmarks are solved again along the paths    window.gaussian
     moments are matched                           window.gaussian
-    a submap goes out                             _close
+    a submap is returned                          _close
 
-A window begins at zero where the last one ended: a submap depends on its own measurements, the
-configuration and (seed, robot, incarnation, sequence) alone. `teamslam.team.estimation.map_joining`
-joins submaps.
+A window begins at zero where the last one ended, so a submap depends on its own measurements, the
+configuration and (seed, robot, incarnation, sequence) alone.
 
-While the window is open a measurement is accepted if it agrees with the earlier ones of its
-landmark under the odometry. At its end a smoother over the window compares all with all. A step
-without a solution does not end the run: the submap is the odometry's motion alone.
+In an open window a measurement is accepted if it agrees with the earlier ones of its landmark under
+the odometry; at its end a smoother compares all with all. A window without a solution becomes a
+submap of the odometry's motion alone.
 """
 
 from collections.abc import Callable
@@ -49,15 +48,15 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import BY_CORE, Rejection
 
 OUTLIER_SHARE = 0.01
-"""Probability of an outlier before the window's measurements are compared. A landmark measurement
-is rejected where it is this much less likely given the others than anywhere in view; with ten times
-the share a tenth of the same likelihood is needed, so the value hardly matters."""
+"""Prior probability of an outlier. A landmark measurement is rejected where it is this much less
+likely given the others than anywhere in view; ten times the share needs a tenth of the same
+likelihood, so the value hardly matters.
+"""
 DEPLETED = 10.0
-"""Effective number of particles; where fewer remain after a keyframe, their scatter is no
-estimate of the uncertainty. It happens in one of a thousand windows of `thesis`, whose submap is
-then far off and overconfident (decision 20)."""
-AGAIN = 8
-"""The window is computed again with this many times the particles."""
+"""Effective number of particles below which their scatter does not estimate the uncertainty: in one
+of a thousand windows of `thesis`, whose submap is then far off and overconfident (decision 20).
+"""
+AGAIN = 8  # factor on the number of particles when the window is computed again
 
 
 UNSOLVED = (core.MotionError, core.NotFiniteError, NotACovarianceError, np.linalg.LinAlgError)
@@ -69,7 +68,7 @@ DUE = core.Segmenter.DUE
 class OpenWindow:
     """The particles since the window's start, and the keyframes.
 
-    core: takes keyframes and motions. Random numbers are keyed by (seed, robot, incarnation,
+    core: receives keyframes and motions. Random numbers are keyed by (seed, robot, incarnation,
     sequence).
     """
 
@@ -97,8 +96,7 @@ class OpenWindow:
         return self.core.rejected + self.settled.gated
 
     def confirm(self) -> None:
-        """Compute the window again if comparing all of it changes its measurements: by outliers, or
-        detections without identities.
+        """Compute the window again without outliers, and with associated detections.
 
         Depleted particles are computed with more of them (with identities and white errors:
         decision 20).
@@ -110,7 +108,7 @@ class OpenWindow:
                 self.core.give_up()
 
     def solve(self, step: Callable[[Window], Solved]) -> Solved | None:
-        """Make the Gaussian of the window by `step`."""
+        """Make the window's Gaussian by `step`; None without a solution."""
         if not self.core.is_solvable:
             return None
         try:
@@ -119,7 +117,7 @@ class OpenWindow:
             return None
 
     def is_sensible(self, submap: LocalMap | None) -> bool:
-        """Whether there is a submap and it lies within the bounds."""
+        """Return whether there is a submap within the bounds."""
         return submap is not None and submap_beyond(submap, self._config.bounds) is None
 
     def _settle(self) -> None:
@@ -135,7 +133,6 @@ class OpenWindow:
             self.core.restart(self.core.accepted(), AGAIN * particles)
 
     def _associate(self) -> None:
-        """Give the window's detections identities, and compute it again with them."""
         front, most = self._config.front_end, self._config.bounds.submap_landmarks
         self.settled = associate_keyframes(
             self.core.accepted(), front.association, self._config.sensor, most
@@ -153,8 +150,8 @@ class OpenWindow:
 class HybridSlam:
     """One incarnation of a robot's stream, from its beginning or last submap.
 
-    segmenter: takes the odometry; where it says DUE, call `advance`. sequence: of the open window.
-    last_measurement: its newest, even a rejected one; set by the caller.
+    segmenter: receives the odometry; when it returns DUE, call `advance`. sequence: of the open
+    window. last_measurement: its newest, with rejected ones; set by the caller.
     """
 
     def __init__(self, config: RobotConfig, incarnation: int) -> None:
@@ -183,13 +180,13 @@ class HybridSlam:
     # A measurement comes in.
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan of landmarks; returns the reason if it is rejected."""
+        """Add a scan of landmarks, or return the reason to reject it."""
         verdict = self.segmenter.observe(stamp_ns, scan)
         self._scans += not verdict
         return BY_CORE[verdict]
 
     def sight(self, stamp_ns: int, measurement: int, looks: TeammateScan) -> Rejection | None:
-        """Take inter-robot measurements; returns the reason if they are rejected."""
+        """Add inter-robot measurements, or return the reason to reject them."""
         if self._grid is None:
             return Rejection.NO_NODES
         if self._is_late(stamp_ns):
@@ -197,7 +194,7 @@ class HybridSlam:
         return self._grid.observe(stamp_ns, measurement, looks)
 
     def fix(self, stamp_ns: int, measurement: int, position: CarriedPoint) -> Rejection | None:
-        """Take a fix of the antenna, or return the reason to reject it."""
+        """Add a fix of the antenna, or return the reason to reject it."""
         if self._grid is None:
             return Rejection.NO_NODES
         if self._is_late(stamp_ns):
@@ -205,16 +202,15 @@ class HybridSlam:
         return self._grid.fix(stamp_ns, measurement, position)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Whether odometry has passed this time, or has not begun."""
         now_ns = self.segmenter.now_ns
         return now_ns is None or stamp_ns < now_ns
 
     def drive(self, interval: OdometryInterval) -> ClosedWindow | None:
-        """Take one odometry interval; returns the window that it closes, if any."""
+        """Process one odometry interval; return the window that it closes, if any."""
         return self.advance() if self.segmenter.drive(interval) >= DUE else None
 
     def advance(self) -> ClosedWindow | None:
-        """Take the keyframes of the last interval; returns the window that it closes, if any."""
+        """Process the keyframes of the last interval; return the window that it closes, if any."""
         segmenter, grid = self.segmenter, self._grid
         if grid is not None:
             grid.pass_stops()
@@ -229,7 +225,7 @@ class HybridSlam:
         return None
 
     def finish(self) -> tuple[ClosedWindow | None, int]:
-        """End the stream; return the last submap, and the number of uncovered scans."""
+        """End the stream; return the last submap and the number of uncovered scans."""
         segmenter = self.segmenter
         uncovered, start_ns, end_ns = segmenter.uncovered, segmenter.start_ns, segmenter.now_ns
         if start_ns is None or end_ns is None or end_ns <= start_ns:
@@ -239,9 +235,8 @@ class HybridSlam:
     # The window closes.
 
     def _is_full(self, lasting_ns: int) -> bool:
-        """Whether the window is long enough to close; a standing robot's stays open.
-
-        Half a submap's largest number of landmarks closes it at once.
+        """Return whether the window closes: it lasts window_s and the robot does not stand, or it
+        has half of a submap's largest number of landmarks.
         """
         if 2 * self.window.core.landmarks >= self._config.bounds.submap_landmarks:
             return True
@@ -250,7 +245,6 @@ class HybridSlam:
         return lasting_ns >= self._window_ns and not stands
 
     def _close(self, start_ns: int, end_ns: int, late: int = 0) -> ClosedWindow:
-        """Close the open window; without a solution its submap is the odometry's motion."""
         rest = self.segmenter.cut(end_ns)
         self._open.core.advance_by(self.segmenter)
         self._open.confirm()
@@ -303,7 +297,7 @@ class HybridSlam:
 
     @property
     def window(self) -> Window:
-        """The particles of the open window, their paths and measurements."""
+        """Particles of the open window, with paths and measurements."""
         return self._open.particles
 
     def running(self) -> RunningWindow | None:

@@ -1,10 +1,10 @@
-"""The team's time grid, at which every robot has a pose node, and inter-robot measurements.
+"""Time grid of the team, at which every robot has a pose node, and inter-robot measurements.
 
-All robots place nodes at the multiples of node_s, since none knows when it is observed. The
-observer's odometry carries an inter-robot measurement to the nearest grid time in the open window
-within sighting_s; several of one teammate at one node are reduced to one, of fixes the nearest in
-time is used. The antenna of a fix delayed by d is T⁻¹ a seen from the robot at the fix's stamp,
-with the motion T over d.
+Robots place nodes at the multiples of node_s, since teammates may observe them there. The
+observer's odometry carries an inter-robot measurement to the nearest grid time within sighting_s in
+the open window; several of one teammate at one node are reduced to one, of fixes the nearest in
+time is used. The antenna of a fix delayed by d is at T⁻¹ a from the robot at the fix's stamp, with
+the motion T over d.
 """
 
 from bisect import insort
@@ -29,8 +29,7 @@ from teamslam.team.rejection import Rejection
 from teamslam.team.shapes import Float
 
 NO_GNSS, NO_MOTION = Gnss(), MotionModel()
-NEVER_NS = 2**62
-"""Behind every stamp."""
+NEVER_NS = 2**62  # after every stamp
 TeammateScan = tuple[tuple[str, ...], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 """Teammates, ranges [m] and bearings [rad] of one message."""
 
@@ -63,7 +62,7 @@ class _Look:
 
 
 class PoseGrid:
-    """The grid times of the open window and its inter-robot measurements: the segmenter's stops."""
+    """Grid times and inter-robot measurements of the open window; the segmenter stops at them."""
 
     def __init__(
         self,
@@ -106,8 +105,8 @@ class PoseGrid:
             self._find_next()
 
     def observe(self, stamp_ns: int, counter: int, looks: TeammateScan) -> Rejection | None:
-        """Keep inter-robot measurements until odometry covers their time; return the reason if all
-        are rejected.
+        """Store inter-robot measurements until odometry covers their time, or return the reason to
+        reject all.
         """
         teammates, ranges, bearings = looks
         node_ns = self._node_near(stamp_ns)
@@ -128,7 +127,7 @@ class PoseGrid:
         return None if mask.any() else Rejection.SENSOR_LIMITS
 
     def fix(self, stamp_ns: int, counter: int, position: CarriedPoint) -> Rejection | None:
-        """Keep a fix until odometry covers its time, or return the reason to reject it."""
+        """Store a fix until odometry covers its time, or return the reason to reject it."""
         node_ns = self._node_near(stamp_ns)
         if node_ns is None:
             return Rejection.NO_NODE
@@ -158,7 +157,7 @@ class PoseGrid:
             self._segmenter.go_on()
 
     def _reach(self) -> None:
-        """Take the node or the measurement at the stop; a node comes before measurements."""
+        """Process the node or the measurement at the stop; a node precedes measurements."""
         segmenter = self._segmenter
         if self._next_ns == self._node_ns <= self._last_ns:
             for look, since in zip(self._ahead, segmenter.reach_node(), strict=True):
@@ -178,14 +177,13 @@ class PoseGrid:
         self._find_next()
 
     def _delayed_antenna(self) -> CarriedPoint:
-        """Place the antenna of a delayed fix in the robot's frame."""
         over, lasting_ns = self._segmenter.interval, abs(self._delay_ns)
         moved = over.gone_on(over.end_ns, lasting_ns).part(model_of(self._motion), lasting_ns, 0)
         carry = carry_on if self._delay_ns > 0 else carry_back
         return carry(self._antenna, Increment(*moved))
 
     def sightings(self) -> tuple[NodeSighting, ...]:
-        """The window's inter-robot measurements and fixes that reached a node."""
+        """List the window's inter-robot measurements and fixes that reached a node."""
         fixes = tuple(_fix_at(*self._fixes[node_ns]) for node_ns in sorted(self._fixes))
         return fixes + tuple(
             NodeSighting(
@@ -213,9 +211,7 @@ def _stamp_of(look: _Look) -> int:
 
 
 def _fix_at(look: _Look, antenna: CarriedPoint) -> NodeSighting:
-    """Make a node's fix. The heading is unknown: the antenna's total variance enters in every
-    direction.
-    """
+    """Make a node's fix, with the antenna's total variance in every direction."""
     assert look.fix is not None
     spread = look.fix.covariance + np.trace(antenna.covariance) * np.eye(2)
     measured = from_station(look.fix.point, spread)

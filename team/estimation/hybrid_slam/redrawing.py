@@ -1,13 +1,13 @@
-"""A window's paths drawn anew when it closes, from the smoothed window, and weighed.
+"""Redraw a closed window's paths from the smoothed window, and weigh them.
 
-Each resampling leaves the particles fewer lines of descent: after forty keyframes all may share one
-path through the first thirty, whose error their scatter does not show. Once associated, the window
-is a smoothing problem. M paths x are drawn from the Gaussian q of its solution, and weigh
+Resampling leaves few lines of descent: after forty keyframes all particles may share one path
+through the first thirty, whose error their scatter does not show. Once associated, the window is a
+smoothing problem. M paths x are drawn from the Gaussian q of its solution, and weigh
 
     w ∝ p(x) Π_l ∫ p(z_l | x, l) dl / q(x),
 
 with the integral over each landmark l by Laplace's method: importance sampling from the Laplace
-approximation (Geweke 1989, Econometrica 57(6)), whose paths have no common ancestors.
+approximation (Geweke 1989, Econometrica 57(6)).
 """
 
 from collections.abc import Sequence
@@ -27,17 +27,17 @@ from teamslam.team.shapes import Float, Int64
 
 Paths = Float[np.ndarray, "K M 3"]
 FEW = 10.0
-"""Effective number of lines of descent below which the scatter of paths is no estimate of their
-uncertainty, as of particles (`pipeline.DEPLETED`).
+"""Effective number of lines of descent below which the scatter of paths does not estimate their
+uncertainty (as `pipeline.DEPLETED` of particles).
 """
 
 
 def redraw_paths(window: Window, keyframes: Sequence[core.Keyframe], random: core.Random) -> None:
-    """Draw the window's paths anew, if few lines of descent are left and the new ones are more.
+    """Redraw the window's paths if few lines of descent are left and the new paths are more.
 
     A sample counts by its effective size 1/Σ w², the particles by w summed over those of one pose
-    at the first keyframe. Draws 3 K M normal numbers, if any. keyframes: whose measurements the
-    window has used.
+    at the first keyframe. Draws 3 K M normal numbers, if any. keyframes: those whose measurements
+    the window has used.
     """
     weights = core.exp(window.particles.log_weights)
     if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
@@ -62,14 +62,12 @@ def redraw_paths(window: Window, keyframes: Sequence[core.Keyframe], random: cor
 
 
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
-    """Effective number of ancestors at the first keyframe."""
     _, ancestor = np.unique(window.paths[0], axis=0, return_inverse=True)
     shares: Float[np.ndarray, " n"] = np.bincount(ancestor.ravel(), weights)
     return 1.0 / float(dense.product(shares, shares))
 
 
 def _slots(window: Window) -> Int64[np.ndarray, " N"]:
-    """Place of each measurement's landmark among the particles'."""
     known = window.particles.ids
     order = np.argsort(known)
     found: Int64[np.ndarray, " N"] = order[np.searchsorted(known[order], window.ids)]
@@ -96,9 +94,7 @@ def _scans(window: Window, keyframes: Sequence[core.Keyframe]) -> Scans:
 def _drawn(
     now: SmoothedWindow, scans: Scans, count: int, random: core.Random
 ) -> tuple[Paths, Float[np.ndarray, " M"]]:
-    """Draw paths from the smoothed window's Gaussian, with log p(path) − log q(path) up to a
-    constant.
-    """
+    """Draw paths from the smoothed window's Gaussian; return log p(path)/q(path) + constant."""
     k = len(now.poses)
     normals = random.normals(count, 3 * k)
     L = dense.cholesky(now.covariance[: 3 * k, : 3 * k])
@@ -116,7 +112,7 @@ def _drawn(
 
 
 def _composed(poses: Float[np.ndarray, "K 3"], xi: Float[np.ndarray, "K M 3"]) -> Paths:
-    """Paths with the errors ξ (forward, left, turn) of their poses, composed of their motions.
+    """Compose paths with the errors ξ (forward, left, turn) of their poses from their motions.
 
     The error of motion k, ξ_k − Ad(motion⁻¹) ξ_{k−1} (determinant 1), is small even for far poses,
     whose own errors would bend the path.
@@ -148,9 +144,6 @@ def _placed(
 def _landmarks(
     window: Window, paths: Paths, measured: tuple[Scans, Int64[np.ndarray, " N"]]
 ) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
-    """Solve the landmarks given each path, from the mean of their measurements, all
-    errors white.
-    """
     (scans, slots), particles = measured, window.particles
     points = np.broadcast_to(scans.points[:, None], (len(slots), paths.shape[1], 2))
     starts = np.zeros((len(particles.ids), paths.shape[1], 2))
@@ -176,9 +169,9 @@ def _likelihood(
     covariances: Float[np.ndarray, "M L 3"],
     measured: tuple[Scans, Int64[np.ndarray, " N"]],
 ) -> Float[np.ndarray, " M"]:
-    """Log p(measurements | path) up to a constant, landmarks integrated out by Laplace's method.
+    """log p(measurements | path) + constant, landmarks integrated out by Laplace's method.
 
-    The noise of a point is Gaussian in the plane, that of others in range and bearing.
+    The noise of a POINT is Gaussian in the plane, that of others in range and bearing.
     """
     scans, slots = measured
     at = paths[scans.keyframes]
@@ -205,7 +198,6 @@ def _likelihood(
 def _seen(
     poses: Float[np.ndarray, "K M 3"], apart: Float[np.ndarray, "K M 2"]
 ) -> Float[np.ndarray, "K M 2"]:
-    """Rᵀ d of each difference d from a pose."""
     s, c = core.sin_and_cos(poses[..., 2])
     x, y = apart[..., 0], apart[..., 1]
     return np.stack((c * x + s * y, c * y - s * x), axis=-1)

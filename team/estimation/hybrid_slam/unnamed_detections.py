@@ -1,7 +1,7 @@
 """Association of a window's detections without identities, when the window closes.
 
-Until then the pose follows the odometry and the landmarks with identities. Detections are
-associated once, for all particles, which run over the window again.
+Until then the pose follows the odometry and named landmarks. Detections are associated once for all
+particles, which are then computed again.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,8 @@ from teamslam.team.shapes import Bool, Int64
 class AssociatedKeyframes:
     """A window's keyframes with their associated detections.
 
-    unnamed: the landmarks without identities, and the scans that saw them. gated: number of
-    detections left out. slips: of the odometry. became: the outcome of each detection.
+    unnamed: landmarks without identities, and the scans that observed them. gated: number of
+    detections left out. became: outcome of each detection.
     """
 
     keyframes: tuple[core.Keyframe, ...]
@@ -40,7 +40,7 @@ class AssociatedKeyframes:
 class Event(NamedTuple):
     """An instant of a window: a scan without identities, or the end of a keyframe.
 
-    keyframe: its index. motion: since the event before. look: of a scan without identities.
+    keyframe: its index. motion: since the previous event. look: of a scan without identities.
     """
 
     at_ns: int
@@ -53,9 +53,9 @@ class Event(NamedTuple):
 def associate_keyframes(
     keyframes: Sequence[core.Keyframe], settings: AssociationSettings, sensor: Sensor, most: int
 ) -> AssociatedKeyframes:
-    """Associate the window's detections. Raises LinAlgError where it has no solution.
+    """Associate the window's detections. Raises LinAlgError without a solution.
 
-    keyframes: with measurements of named landmarks, and the scans without. most: largest number of
+    keyframes: with measurements of named landmarks, and scans of others. most: largest number of
     landmarks of a submap; those with the most detections stay.
     """
     events = events_of(keyframes)
@@ -82,7 +82,7 @@ def associate_keyframes(
 
 
 def events_of(keyframes: Sequence[core.Keyframe]) -> list[Event]:
-    """List the scans and keyframe ends of a window by time; a keyframe that is only one scan is one
+    """List the scans and keyframe ends of a window by time; a keyframe of a single scan is one
     event.
     """
     events = []
@@ -135,8 +135,8 @@ def _number_keyframes(
     numbers: Int64[np.ndarray, " n"],
     slips: tuple[Slip, ...],
 ) -> tuple[core.Keyframe, ...]:
-    """Add the scans' detections to their keyframes under landmark numbers (0: left out), one
-    measurement per landmark; a motion that slipped gets a larger covariance.
+    """Add the detections to their keyframes by landmark number (0: left out), one per landmark;
+    enlarge the covariance of motions that slipped.
     """
     looks: dict[int, list[tuple[Scan, Pose | None]]] = {}
     first = 0
@@ -170,7 +170,6 @@ def _select_numbered(scan: Scan, numbers: Int64[np.ndarray, " n"]) -> Scan:
 
 
 def _reduce_scans(looks: Sequence[tuple[Scan, Pose | None]]) -> Scan:
-    """Reduce a keyframe's scans to its end; a scan that is the keyframe stays."""
     if len(looks) == 1 and looks[0][1] is None:
         return looks[0][0]
     poses = np.array([np.zeros(3) if back is None else back for _, back in looks])

@@ -1,8 +1,8 @@
-"""One window of Hybrid-SLAM: particles that start at zero, and the one Gaussian they become.
+"""One window of Hybrid-SLAM: particles that start at zero, and the Gaussian that they become.
 
-The front end runs FastSLAM in the frame of the window's start. Moment matching makes a submap after
-each landmark of each particle is solved again along its path: an EKF is linearised at the first,
-noisiest measurement, a bias common to many submaps. Brooks and Bailey 2009, HybridSLAM.
+FastSLAM runs in the frame of the window's start. Before moment matching makes a submap, each
+landmark of each particle is solved again along its path: an EKF is linearised at the first,
+noisiest measurement, a bias common to many submaps (Brooks and Bailey 2009, HybridSLAM).
 """
 
 from collections.abc import Sequence
@@ -31,19 +31,19 @@ class Innovation(NamedTuple):
     """Σ νᵀ S⁻¹ ν (NIS) of predicted measurements, χ² of `dof` degrees of freedom, two for each.
 
     A consistency check without ground truth (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
-    Both add up over keyframes, whose innovations are independent where the models are right.
+    Both add up over keyframes, whose innovations are independent if the models are right.
     """
 
     squared: float
     dof: int
 
     def plus(self, other: "Innovation") -> "Innovation":
-        """The sum of both."""
+        """Add both terms."""
         return Innovation(self.squared + other.squared, self.dof + other.dof)
 
     @property
     def per_dof(self) -> float | None:
-        """About 1 where the models are right, larger for larger noise."""
+        """NIS per degree of freedom; about 1 if the models are right."""
         return self.squared / self.dof if self.dof else None
 
 
@@ -53,8 +53,8 @@ NOTHING = Innovation(0.0, 0)
 class Window(msgspec.Struct, gc=False):
     """Particles since the window's start, their paths, and the measurements used.
 
-    The core holds them, `advance` changes them; the properties are copies, K keyframes, N
-    measurements and M particles. Poses are the sensor's, in the frame of its start.
+    The properties are copies of the core's state: K keyframes, N measurements, M particles. Poses
+    are the sensor's, in the frame of its start.
     """
 
     front_end: FrontEnd
@@ -63,7 +63,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def innovation(self) -> Innovation:
-        """NIS of all measurements that were predicted so far."""
+        """NIS of all measurements predicted so far."""
         return Innovation(*self.core.innovated)
 
     @property
@@ -73,7 +73,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def biases(self) -> tuple[Bias, ...]:
-        """The biases with derivatives; without `forward_scale` where all motion is calibrated."""
+        """Biases with derivatives; without `forward_scale` if all motion is calibrated."""
         biases = self.front_end.biases
         if "forward_scale" in biases and not self.core.has_shifts:
             return tuple(each for each in biases if each != "forward_scale")
@@ -81,7 +81,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def particles(self) -> Particles:
-        """The particles after the last keyframe or motion."""
+        """Particles after the last keyframe or motion."""
         return Particles(*self.core.particles())
 
     @property
@@ -91,27 +91,27 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def keyframes(self) -> Int64[np.ndarray, " N"]:
-        """The keyframe of each measurement, in [0, K)."""
+        """Keyframe of each measurement, in [0, K)."""
         return self.core.measurements()[0]
 
     @property
     def ids(self) -> UInt32[np.ndarray, " N"]:
-        """The landmark of each measurement."""
+        """Landmark of each measurement."""
         return self.core.measurements()[1]
 
     @property
     def measurements(self) -> Float[np.ndarray, "N 2"]:
-        """(range [m], bearing [rad]) with the sensor's calibration applied."""
+        """Calibrated (range [m], bearing [rad])."""
         return self.core.measurements()[2]
 
     @property
     def own(self) -> Own:
-        """The noises that the measurements claim (`teamslam.team.estimation.scans`)."""
+        """Noises that the measurements claim (`teamslam.team.estimation.scans`)."""
         return self.core.measurements()[3]
 
     @property
     def landmarks(self) -> UInt32[np.ndarray, " L"]:
-        """The landmarks in order of first sight."""
+        """Landmarks in order of first observation."""
         return self.core.ids()
 
 
@@ -119,11 +119,10 @@ class Window(msgspec.Struct, gc=False):
 class ClosedWindow:
     """A submap with the names of its inputs, and the inter-robot measurements from its pose nodes.
 
-    window, keyframes_ns: its particles with their paths, and the keyframes' team times, if solved.
-    innovation: of predicted measurements. gated: measurements that no others confirmed. late:
-    rejected scans, stamped behind the window's end. became: outcomes of detections without
-    identity. slips: motions that the odometry missed. unsolved: scans without a Gaussian, of which
-    the submap has only the motion.
+    window, keyframes_ns: particles with their paths, and the keyframes' team times, if solved.
+    gated: measurements that no others confirmed. late: rejected scans stamped after the window's
+    end. became: outcomes of detections without identity. slips: motions that the odometry missed.
+    unsolved: scans of a submap of motion alone.
     """
 
     sequence: int
@@ -166,12 +165,12 @@ def advance(
     *,
     own: Own | None = None,
 ) -> None:
-    """Take a keyframe: the motion since the last one, then its measurements.
+    """Process a keyframe: the motion since the last one, then its measurements.
 
-    These are accepted and corrected (`models.scanned`). The innovation omits those of singular
-    predictive covariance. forward: the motion's shift by an error of the scale of speed, and its
-    duration (`core.Odometry`). own: claimed noises (`teamslam.team.estimation.scans`). Raises
-    NotACovarianceError, and leaves the window as it was.
+    The measurements are accepted and corrected (`models.scanned`). The innovation omits those of
+    singular predictive covariance. forward: the motion's shift by an error of the scale of speed,
+    and its duration (`core.Odometry`). own: claimed noises (`teamslam.team.estimation.scans`).
+    Raises NotACovarianceError, and leaves the window unchanged.
     """
     seen = ids, ranges, bearings, unclaimed(len(ids)) if own is None else own
     with CoreErrors():
@@ -184,8 +183,8 @@ def gaussian(window: Window) -> LocalMap:
     Each landmark of each particle is solved again given the path. With w and (poses, landmarks) of
     each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ =
     μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on SE(2), plus POSE_JITTER. Poses
-    and landmarks are those of the base, in the frame of its start. Derivatives by the biases, as
-    precise as in a message, are those of the window's smoother. Raises NotACovarianceError.
+    and landmarks are the base's, in the frame of its start. The window's smoother gives derivatives
+    by the biases, with the precision of a message. Raises NotACovarianceError.
     """
     ids, mean, covariance, fault = window.core.close()
     _raise_fault(fault, "the submap of a window")
@@ -208,7 +207,7 @@ def _raise_fault(fault: int, what: str) -> None:
 class RunningWindow(NamedTuple):
     """The Gaussian (end pose, landmarks) of an open window, which is not fused.
 
-    It is `gaussian` without pose nodes and, where all errors are white, with the particles' own
+    As `gaussian` without pose nodes and, if all errors are white, with the particles' own
     landmarks. window: None for the odometry's motion alone.
     """
 
@@ -217,16 +216,13 @@ class RunningWindow(NamedTuple):
 
     @property
     def motion(self) -> core.WholeMap:
-        """The marginal over the end pose alone."""
+        """Marginal over the end pose."""
         return core.WholeMap(self.map.ids[:0], *self.map.pose())
 
     def corrected(
         self, covariance_factor: float, biases: Sequence[tuple[Bias, float, float]]
     ) -> core.WholeMap:
-        """Correct the map as `SubmapCorrection` does a submap.
-
-        Raises NotACovarianceError where the window's smoother has no solution.
-        """
+        """Correct the map as `SubmapCorrection` does a submap. Raises NotACovarianceError."""
         known: tuple[Bias, ...] = () if self.window is None else self.window.biases
         errors = [(b, sigma, BIASES.index(name)) for name, b, sigma in biases if name in known]
         if covariance_factor == 1.0 and not errors:
@@ -249,7 +245,7 @@ def running(window: Window) -> RunningWindow:
 def of_base(window: Window) -> Window:
     """Convert particles and paths to the base, in the frame of its start pose.
 
-    With the sensor at the base's origin it is the window itself, not a copy.
+    Returns the window itself if the sensor is at the base's origin.
     """
     if not window.sensor.is_mounted:
         return window
@@ -257,7 +253,7 @@ def of_base(window: Window) -> Window:
 
 
 def motion_alone(motion: Increment) -> LocalMap:
-    """The Gaussian of a window's odometry alone, in the window's frame."""
+    """Make the Gaussian of a window's odometry alone."""
     G = tangent(motion.mean[2])
     covariance = dense.product(dense.product(G, motion.covariance), G.T) + np.diag(core.POSE_JITTER)
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))

@@ -1,7 +1,7 @@
 """The path within a closed window, given the pose at its end.
 
-The earlier poses are a linear Gaussian given the end, which a submap contains: a map that moves the
-two ends moves the path between them.
+Given the end, which a submap contains, the earlier poses are a linear Gaussian, so a map that moves
+the two ends moves the path between them.
 """
 
 from collections.abc import Sequence
@@ -70,10 +70,10 @@ class Ends:
 def placed(
     path: WindowPath, ends: Ends, covariance_factor: float = 1.0
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3 3"]]:
-    """Keyframe poses and covariances in the map's frame, in (x, y, theta).
+    """Return keyframe poses and covariances in the map's frame, in (x, y, theta).
 
     x = start ∘ (mean + gain (start⁻¹ ∘ end − end_mean)), to first order in both ends and in the
-    remainder, whose covariance is taken times covariance_factor.
+    remainder, whose covariance is multiplied by covariance_factor.
     """
     heading = ends.start[2]
     s, c = core.sin_and_cos(heading)

@@ -211,7 +211,6 @@ def find_odometry_ties(
 
 
 def _tabulate(island: Island, nodes: Collection[int]) -> Bool[np.ndarray, "K n"]:
-    """Tabulate which submaps observe which landmarks."""
     at = np.full(len(island.graph.fixed), -1, np.int64)
     at[[*nodes]] = np.arange(len(nodes))
     sees = np.zeros((len(island.graph.submaps), len(nodes)), np.bool_)

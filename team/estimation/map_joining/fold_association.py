@@ -97,7 +97,6 @@ class _IslandViews:
         self._of: dict[Stream, tuple[Island, IslandView]] = {}
 
     def view(self, fold: Fold, key: Stream) -> IslandView:
-        """View the island with this key."""
         island = fold.islands[key]
         known = self._of.get(key)
         if known is None or known[0] is not island:

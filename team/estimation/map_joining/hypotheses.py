@@ -129,7 +129,6 @@ class _Two(NamedTuple):
 def _chi2_about(
     sights: Sights, point: Float[np.ndarray, "*k 2"], own: slice | Bool[np.ndarray, " n"] = ALL
 ) -> Costs:
-    """Evaluate the χ² of observations about one place, or about k places (k × 1 × 2)."""
     return _chi2_of(sights.points[own] - point, sights.spread[own])
 
 
@@ -234,7 +233,6 @@ class _Solved:
 
     @cached_property
     def cost(self) -> float:
-        """Cost at the final robust scales."""
         return final_cost(self.island)
 
 
@@ -375,7 +373,6 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 
 
 def _is_known_start(graph: Graph, place: int) -> bool:
-    """Return whether a robot's submap begins at an initial pose, exact or with a covariance."""
     start = int(graph.submaps[place].nodes[0])
     if is_map(graph.submaps[place].contribution.stream):
         return False
@@ -446,7 +443,6 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
 
 
 def _is_beyond_doubt(each: Hypothesis, scale: float, level: float) -> bool:
-    """Return whether the evidence exceeds chance and the effect its scatter."""
     sizes = [(math.hypot(*each.value[:2]), max(each.sigma[:2]))]
     sizes += [
         (abs(turn), sigma) for turn, sigma in zip(each.value[2:], each.sigma[2:], strict=True)
@@ -503,7 +499,6 @@ def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list
 
 
 def _is_beside_sound(jump: Hypothesis, base: _Solved, level: float) -> bool:
-    """Return whether a submap beside a jump agrees with the map."""
     island = base.island
     costs = terms(island).submaps
     is_sound = (costs.chi2 <= base.scale * (costs.dof + level)).tolist()

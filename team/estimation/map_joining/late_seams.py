@@ -196,7 +196,6 @@ def _best_place(
 def _list_places(
     sights: _Sights, rows: list[int], misses: Misses, possible: Bool[np.ndarray, "n n"]
 ) -> Iterator[_Place]:
-    """List the candidates of a stream by time: between two submaps, or inside one."""
     for k in range(LEAST_BEFORE, len(rows)):
         before, row = rows[k - 1], rows[k]
         for after in (k, k + 1):
@@ -256,7 +255,6 @@ def _weigh_place(
 
 
 def _least_tracked(submap: Joined) -> int:
-    """Return the least number of landmarks observed on both sides of a scan."""
     seen = submap.contribution.local.unnamed.seen
     before = np.logical_or.accumulate(seen, axis=1)[:, :-1]
     after = np.logical_or.accumulate(seen[:, ::-1], axis=1)[:, ::-1][:, 1:]

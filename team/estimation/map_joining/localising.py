@@ -93,7 +93,6 @@ class _Shared(NamedTuple):
         in_team: Int64[np.ndarray, " n"],
         in_own: Int64[np.ndarray, " n"],
     ) -> "_Shared":
-        """Select the marginals of the landmarks at these indices."""
         at, of = _points(in_team), np.concatenate([np.arange(3), 3 + _points(in_own)])
         return cls(
             team.ids[in_team],
@@ -105,11 +104,9 @@ class _Shared(NamedTuple):
 
     @property
     def b(self) -> Float[np.ndarray, "n 2"]:
-        """Robot's landmarks [m]."""
         return self.mean[3:].reshape(-1, 2)
 
     def fit(self) -> tuple[Alignment | None, str | None]:
-        """Align the landmarks; return the alignment and the reason of a refusal."""
         shared, fit = SharedPoints(len(self.ids)), None
         if len(self.ids) >= NEEDED:
             fit = align(self.a, self.A, self.b, self.P[3:, 3:])

@@ -61,7 +61,6 @@ def describe_refusals(fold: Fold) -> list[str]:
 def _select_reachable(
     fold: Fold, contributions: Sequence[Contribution], outside: Mapping[Key, str]
 ) -> tuple[Fold, list[Contribution]]:
-    """Select the submaps to try; refuse those out of bounds, or after a refused one."""
     refused = dict(fold.refused)
     ended = {(robot, incarnation) for _, robot, incarnation, _ in refused}
     members = []
@@ -121,7 +120,6 @@ class _Selection:
     def add_solvable(
         self, members: Sequence[Contribution], sightings: Sequence[InterRobotFactor]
     ) -> Fold:
-        """Add the submaps, then new and waiting inter-robot measurements."""
         unseen = replace(self._fold, waiting=())
         self._grow(unseen, members)
         base = replace(

@@ -88,7 +88,6 @@ def _least_squares(
 
 
 def _list_equations(graph: Graph, at: Indices) -> Iterator[_Rows]:
-    """List the equations; `at`: first number of each node."""
     for contribution, nodes, *_ in graph.submaps:
         local, start = contribution.local, int(at[nodes[0]])
         variances = np.diag(local.covariance)
