@@ -169,7 +169,7 @@ def _likelihood(
     covariances: Float[np.ndarray, "M L 3"],
     measured: tuple[Scans, Int64[np.ndarray, " N"]],
 ) -> Float[np.ndarray, " M"]:
-    """log p(measurements | path) + constant, landmarks integrated out by Laplace's method.
+    """Compute log p(measurements | path) + constant, landmarks integrated out by Laplace's method.
 
     The noise of a POINT is Gaussian in the plane, that of others in range and bearing.
     """
