@@ -1,1 +1,1 @@
-"""A robot of the team: its node (no I/O), the parts of the node, and its process."""
+"""A robot of the team: its node (no I/O), the node's parts, and its process."""

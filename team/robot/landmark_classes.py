@@ -17,7 +17,7 @@ def classify_landmarks(
 ) -> ClosedWindow:
     """Sum ln P(reported class | class) of each unnamed landmark's detections, at a window's close.
 
-    Unchanged without classes. Detections of other numbers of classes are left out.
+    Detections of other numbers of classes are left out.
     """
     rows = {
         each.stamp_ns: translate.classes_of(each, len(each.ranges) // 8)

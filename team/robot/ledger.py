@@ -7,23 +7,18 @@ from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.rejection import Rejection
 from teamslam.team.wire import messages as m
 
-IN_SIGHTING = "in a sighting factor"
-"""The disposition of an inter-robot measurement that was used."""
-INITIAL_POSE = "start pose"
-"""The disposition of an incarnation's measurement 0."""
+IN_SIGHTING = "in a sighting factor"  # disposition of a used inter-robot measurement
+INITIAL_POSE = "start pose"  # disposition of an incarnation's measurement 0
 
 OnDisposition = Callable[[int, str], None]
-"""Receives the counter of a measurement and its disposition; a later call for the same one replaces
-it.
-"""
+"""Receives the counter of a measurement and its disposition, which replaces an earlier one."""
 
 
 class Ledger:
-    """The number of an incarnation's measurements by their disposition.
+    """Numbers of an incarnation's measurements by disposition.
 
-    used: of a measurement that the estimator takes, counted on arrival. Scans and inter-robot
-    measurements are stored until the closing window lists those not used. on_disposition: receives
-    each.
+    used: disposition of an accepted measurement, counted on arrival. Scans and inter-robot
+    measurements are stored until the closing window lists those not used.
     """
 
     def __init__(
@@ -70,7 +65,7 @@ class Ledger:
         return by_stamp[len(by_stamp) - count :]
 
     def cover(self, until_ns: int) -> None:
-        """Settle every scan up to this time as used, for an estimator without windows."""
+        """Count every scan up to this time as used, for an estimator without windows."""
         self._scans = {n: at_ns for n, at_ns in self._scans.items() if at_ns > until_ns}
         self._detections.clear()
 
@@ -96,11 +91,11 @@ class Ledger:
         self._sighted.clear()
 
     def uncover(self, count: int) -> None:
-        """Recount a stream's last scans, behind all odometry."""
+        """Recount a stream's last scans, after all odometry."""
         self._reject(self._last_scans(count), Rejection.NOT_COVERED, self.used)
 
     def entries(self) -> tuple[m.Disposition, ...]:
-        """The dispositions for the robot's `Done`."""
+        """List the dispositions for the robot's `Done`."""
         return tuple(
             m.Disposition(disposition=name, measurements=count)
             for name, count in sorted(self.counts.items())

@@ -1,4 +1,4 @@
-"""The robot's process: the node's shell, which recovers missed messages and continues an earlier
+"""Process of a robot: the node's shell, which recovers missed messages and resumes an earlier
 process.
 """
 
@@ -20,19 +20,17 @@ from teamslam.team.wire.bus import Bus, BusError, Sample, Tap
 from teamslam.team.wire.codec import WireError, decoded, encoded
 
 SECOND_PATIENCE_S = 6.0
-"""Wait [s] for another process' token: that of a cut-off process lasts for its lease of 5 s."""
+"""Wait [s] for another process' token, which lasts for its lease of 5 s after a cut."""
 SECOND_PERIOD_S = 0.5
-CONFIRMED_S = 1.0
-"""Wait [s] between two questions to the source which incarnation its stream is in."""
-MOST_DOUBTED = 1_000
-"""Ends that wait for the source's word at a time."""
+CONFIRMED_S = 1.0  # wait [s] between two requests to the source for its stream's incarnation
+MOST_DOUBTED = 1_000  # most ends that the source has not confirmed yet
 LOG_LOOK_S, LOG_RARELY_S = 2.0, 60.0
-"""Least and greatest wait [s] between two checks for what the robot's own log lacks."""
+"""Least and greatest wait [s] between two checks for losses of the robot's own log."""
 _LOG = logging.getLogger("teamslam")
 
 
 class RobotShell:
-    """A robot's process: it subscribes, continues an earlier process, and runs.
+    """Process of a robot: it subscribes, resumes an earlier process, and runs.
 
     `run` raises BusError when another process runs this robot for `patience_s`; FaultyRunError, at
     its end, when messages were set aside.
@@ -60,13 +58,13 @@ class RobotShell:
         self.run_in(Shell(bus, self.node, ch.robot_node(config.id), stop))
 
     def run_in(self, shell: Shell) -> None:
-        """The shell of this process' node."""
+        """Set the shell of this process' node."""
         self.shell = shell
         shell.believed = self._believed
         self._missing = MissingMeasurements(shell, lambda each: self.node.inbox.confirm(each))
 
     def run(self) -> None:
-        """Run until the final map is there."""
+        """Run until the final map arrives."""
         name = self.node.robot
         self._be_the_only_one()
         self._subscribe()
@@ -97,7 +95,7 @@ class RobotShell:
         self.look_for_gaps()
 
     def look_for_gaps(self) -> None:
-        """Ask the source for missing measurements."""
+        """Request missing measurements from the source."""
         requested = self.node.request()
         self._missing.look(() if requested is None else (requested,))
         if self._doubted and time.monotonic() >= self._ends_due_s:
@@ -108,9 +106,9 @@ class RobotShell:
             self._log_due_s = time.monotonic() + self._log_look_s
 
     def _complete_log(self) -> bool:
-        """Request from the source what the robot's log lost; return whether there was any.
+        """Request what the robot's log lost from the source; return whether there was any.
 
-        The log also has the answers to the robot's own requests.
+        The log also records the answers to the robot's own requests.
         """
         lost = False
         tap: Tap | None = getattr(self.bus, "tap", None)
@@ -126,7 +124,7 @@ class RobotShell:
     def _ask_source(
         self, incarnation: int, first: int, last: int, *, only: bool = False
     ) -> list[m.Measurement] | None:
-        """Request measurements first … last of the stream; None without a sound answer."""
+        """Request measurements first … last of the stream; None without a valid answer."""
         request = m.MeasurementsRequest(
             stamp_ns=0,
             robot=self.node.robot,
@@ -149,7 +147,7 @@ class RobotShell:
         self.bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:
-        """Stay until the recorder has every submap: it has no other source."""
+        """Run until the recorder has every submap, since it has no other source."""
         recorded: dict[int, int] = {}
 
         def take(samples: Sequence[Sample]) -> None:
@@ -176,7 +174,7 @@ class RobotShell:
                 )
 
     def _resume(self) -> bool:
-        """Take over an earlier process's submaps from the centre; return whether there are any."""
+        """Resume from an earlier process's submaps at the centre; return whether there are any."""
         requested = m.SubmapsRequest(stamp_ns=0, robot=self.node.robot)
         try:
             replies = self.bus.ask(ch.SUBMAPS, "", requested, ASK_TIMEOUT_S)
@@ -224,8 +222,8 @@ class RobotShell:
                 return
 
     def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Drop the ends and initial poses that the source does not confirm: a new incarnation ends
-        the one before. Without a source (a replayed log) the message alone counts.
+        """Drop the ends and initial poses that the source does not confirm, since a new incarnation
+        ends the previous one. Without a source (a replayed log) the message alone counts.
         """
         passed = []
         for sample in samples:
@@ -258,9 +256,8 @@ class RobotShell:
         return passed
 
     def _is_doubted(self, sample: Sample) -> bool:
-        """Whether a sample is an announced end, which the source must confirm.
-
-        Without keys anyone may announce one, or publish measurements behind it.
+        """Return whether a sample is an announced end, which the source must confirm: without keys
+        any node may announce one.
         """
         if sample.key != ch.END.key():
             return False
@@ -274,7 +271,7 @@ class RobotShell:
         return True
 
     def _ask_about_ends(self) -> None:
-        """Ask the source which announced end is true; without a source (a replayed log) the message
+        """Confirm announced ends at the source; without a source (a replayed log) the message
         counts.
         """
         self._ends_due_s = time.monotonic() + CONFIRMED_S
@@ -298,7 +295,7 @@ class RobotShell:
         return any(self.bus.is_alive(n) for n in ("world", ch.source_node(self.node.robot)))
 
     def _beginning_at_source(self) -> m.InitialPose | None:
-        """The source's initial pose of the stream's current incarnation."""
+        """Request the initial pose of the stream's current incarnation."""
         starts = [x for x in self._ask_source(0, 0, 0) or () if isinstance(x, m.InitialPose)]
         return max(starts, key=lambda start: start.incarnation, default=None)
 

@@ -1,10 +1,10 @@
-"""The robot's mapper: measurements in their order in, messages out.
+"""The robot's mapper, from ordered measurements to messages.
 
     bounds → Hybrid-SLAM → ledger → submap → own map → poses
     check    estimate      account   publish
 
-Law 1: what is published for fusion depends on the robot's own measurements alone. The team's map is
-used for `team/pose` only.
+Law 1: what is published for fusion depends on the robot's own measurements alone. The team's map
+serves `team/pose` only.
 """
 
 from collections import deque
@@ -33,14 +33,12 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 
 MOST_SET_ASIDE = 8
-"""After so many measurements of one window were set aside, the window is not computed again for
-further ones."""
+"""Measurements of one window set aside after which the window is not computed again."""
 
-MOST_WARNINGS = 64
-"""Number of the newest warnings that are kept."""
+MOST_WARNINGS = 64  # number of stored warnings, the newest
 
 Replaced = Callable[[ClosedWindow, m.Prior | None, Sequence[LocalMap]], ClosedWindow]
-"""Replacement of a closed window, given the team's map and the submaps before it."""
+"""Replacement of a closed window, given the team's map and the earlier submaps."""
 
 
 class Mapper:
@@ -82,7 +80,7 @@ class Mapper:
     # An incarnation begins, and ends.
 
     def begin(self, start: m.InitialPose) -> None:
-        """Begin an incarnation, from its initial pose."""
+        """Begin an incarnation from its initial pose."""
         initial = self._plausible_start(start)
         is_known = initial.pose is not None
         self.writer = MessageWriter(self.config.id, start.incarnation, self._digest, is_known)
@@ -104,7 +102,7 @@ class Mapper:
         self.own_map = OwnMap(initial)
 
     def _plausible_start(self, start: m.InitialPose) -> InitialPose:
-        """The initial pose and covariance; unknown if beyond the bounds."""
+        """Return the initial pose and covariance; unknown if beyond the bounds."""
         value = translate.start_of(start)
         why = None if value is None else start_beyond(value, self.config.bounds)
         if why is not None:
@@ -113,7 +111,7 @@ class Mapper:
         return InitialPose(*translate.pose_of(start))
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Continue after an incarnation's last submap of an earlier process."""
+        """Continue after the last submap of an incarnation's earlier process."""
         self.begin(start)
         for submap in submaps:
             self.submaps.restore(submap)
@@ -140,7 +138,7 @@ class Mapper:
     # A measurement.
 
     def take(self, measurement: m.Measurement) -> bool:
-        """Take the next measurement; return whether it closed a window."""
+        """Process the next measurement; return whether it closed a window."""
         self._taking = measurement
         if m.is_odometry(measurement):
             return self.drive(measurement)
@@ -148,9 +146,9 @@ class Mapper:
         return False
 
     def note_time(self, stamp_ns: int, passed_ns: int) -> bool:
-        """Note a measurement's team time and the time that has passed with it.
+        """Record a measurement's team time and the time that has passed with it.
 
-        False after a clock leap beyond the stamps that receivers take.
+        Returns False after a clock leap beyond the stamps that receivers accept.
         """
         if not -EARLY_NS <= stamp_ns - self._began_ns <= LATE_NS:
             return False
@@ -167,7 +165,7 @@ class Mapper:
         self._taking = None
 
     def drive(self, measurement: m.AnyOdometry) -> bool:
-        """Take an odometry interval; return whether it closed the window."""
+        """Process an odometry interval; return whether it closed the window."""
         outcome = self._drive(measurement)
         rejected = BY_CORE[outcome % DUE]
         if outcome < DUE:  # most intervals
@@ -186,7 +184,7 @@ class Mapper:
         return False
 
     def _drive(self, measurement: m.AnyOdometry) -> int:
-        """Judge and integrate an odometry interval; returns as `core.Segmenter.drive`."""
+        """Check and integrate an odometry interval; return as `core.Segmenter.drive`."""
         end_ns = measurement.stamp_ns + self._offset_ns
         if not self.note_time(end_ns, end_ns):
             return BY_CORE.index(Rejection.TIME)
@@ -197,7 +195,7 @@ class Mapper:
         return drive(translate.interval_of(measurement, self.config))
 
     def _observe(self, measurement: m.Measurement) -> Rejection | None:
-        """Take a scan or an initial pose, or return the reason to reject it.
+        """Add a scan or an initial pose, or return the reason to reject it.
 
         A scan precedes the odometry of its stamp, which may end a window.
         """
@@ -247,7 +245,7 @@ class Mapper:
     ) -> None:
         """Publish a submap before anything can raise, then join it.
 
-        measurement: which closed the window; None: the stream's end.
+        measurement: the one that closed the window; None: the stream's end.
         """
         writer = self.writer
         if closed.became is not None:
@@ -280,28 +278,26 @@ class Mapper:
             self.publish_map(end_ns)
 
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
-        """Whether own map and particles are published at this window's end: a multiple of `pose_s`
-        by stamps alone, as a restarted robot needs.
+        """Return whether own map and particles are published at this window's end: at multiples of
+        `pose_s` by stamps alone, so that a restarted robot publishes the same.
         """
         period_ns = self._period_ns
         return period_ns == 0 or end_ns // period_ns > start_ns // period_ns
 
     def publish_map(self, stamp_ns: int) -> None:
-        """Publish the own map, for viewers."""
+        """Publish the own map for viewers."""
         landmarks = self.own_landmarks()
         self.out.append(self.writer.own_map(stamp_ns, self.sequence, 0, landmarks, "blocks"))
 
     # A fault.
 
     def forget_window(self) -> None:
-        """Forget the measurements of the open window."""
+        """Drop the measurements of the open window."""
         self._window: list[m.Measurement] = []
         self._aside = 0
 
     def set_aside(self) -> bool:
-        """Reset to the state before the measurement whose handling raised; return whether there was
-        one.
-        """
+        """Reset to the state before the measurement that raised; return whether there was one."""
         if self._taking is None:
             return False
         self.ledger.count(self._taking, Rejection.SET_ASIDE)
@@ -331,30 +327,30 @@ class Mapper:
 
     @property
     def judge(self) -> core.StreamJudge:
-        """Checks the stream's times."""
+        """Checks of the stream's times."""
         return self._slam.segmenter.judge
 
     def observe(self, stamp_ns: int, scan: Scan) -> Rejection | None:
-        """Take a scan, or return the reason to reject it."""
+        """Add a scan, or return the reason to reject it."""
         return self._slam.observe(stamp_ns, scan)
 
     def sight(self, measurement: m.Sightings, looks: TeammateScan) -> Rejection | None:
-        """Take inter-robot measurements, or return the reason to reject them."""
+        """Add inter-robot measurements, or return the reason to reject them."""
         return self._slam.sight(measurement.stamp_ns, measurement.number, looks)
 
     def fix(self, measurement: m.Fix) -> Rejection | None:
-        """Take a fix of the antenna, or return the reason to reject it."""
+        """Add a fix of the antenna, or return the reason to reject it."""
         position = translate.fix_of(measurement, self.config)
         return self._slam.fix(measurement.stamp_ns, measurement.number, position)
 
     @property
     def associates(self) -> bool:
-        """Whether the estimator takes detections without identities."""
+        """Whether the estimator accepts detections without identities."""
         return self.config.fusion == "join"
 
     @property
     def sequence(self) -> int:
-        """The number of the open window."""
+        """Number of the open window."""
         return self._slam.sequence
 
     @property
@@ -363,15 +359,15 @@ class Mapper:
         return self._slam.innovation
 
     def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
-        """The running pose by own measurements."""
+        """Return the running pose by own measurements."""
         return self.own_map.pose(window)
 
     def own_landmarks(self) -> LandmarkGaussian:
-        """The running map by own measurements alone."""
+        """Return the running map by own measurements."""
         return self.own_map.landmarks
 
     def open_window(self) -> RunningWindow | None:
-        """Gaussian of the open window at its last keyframe."""
+        """Return the Gaussian of the open window at its last keyframe."""
         return self._slam.running()
 
 

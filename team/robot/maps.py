@@ -1,8 +1,8 @@
 """The robot's maps: its own, joined submap by submap (Brooks and Bailey's back end), and the
 team's, computed anew with each prior.
 
-No submap depends on the own map. It omits landmarks without identities, which only the team's fold
-associates across submaps.
+No submap depends on the own map, which omits landmarks without identities: only the team's fold
+associates them across submaps.
 """
 
 from collections.abc import Sequence
@@ -38,8 +38,7 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
-CLOUD_PARTICLES = 32
-"""Particles in a cloud for viewers."""
+CLOUD_PARTICLES = 32  # particles in a cloud for viewers
 
 
 class InitialPose(NamedTuple):
@@ -69,9 +68,9 @@ def thin_out(particles: Particles, origin: Float[np.ndarray, "3"]) -> Cloud:
 
 
 class OwnMap:
-    """The join of a robot's submaps so far, from its initial pose on.
+    """The join of a robot's submaps so far, from its initial pose.
 
-    origin: the pose at which the last joined submap begins.
+    origin: pose at which the last joined submap begins.
     """
 
     def __init__(self, initial: InitialPose = AT_ORIGIN) -> None:
@@ -79,7 +78,7 @@ class OwnMap:
         self.whole: WholeMap = initial_map(self.origin, initial.covariance)
 
     def join(self, local: LocalMap) -> None:
-        """Join the next submap, or its motion alone if it contradicts numerically."""
+        """Join the next submap, or its motion alone if it contradicts the map numerically."""
         self.origin, _ = self.whole.pose()
         named = local.named
         try:
@@ -91,7 +90,7 @@ class OwnMap:
         self.whole = after
 
     def pose(self, window: RunningWindow | None) -> PoseGaussian:
-        """The pose after the open window, or its motion alone if contradictory."""
+        """Estimate the pose after the open window, or after its motion alone if contradictory."""
         try:
             return compose_pose(self.whole, None if window is None else window.map).pose
         except UNSOLVABLE:
@@ -99,21 +98,21 @@ class OwnMap:
 
     @property
     def landmarks(self) -> LandmarkGaussian:
-        """The landmarks of the map."""
+        """Landmarks of the map."""
         whole = self.whole
         return LandmarkGaussian(whole.ids, whole.mean[3:].reshape(-1, 2), whole.covariance[3:, 3:])
 
 
 CONDENSED = 16
-"""Number of submaps that are condensed into the map behind them once as many follow them."""
+"""Number of submaps that are condensed into the map before them once as many follow them."""
 
 
 class TeamMap:
-    """The joint map of the last prior and the robot's later submaps, recomputed on change.
+    """Joint map of the last prior and the robot's later submaps.
 
-    Without new priors the oldest submaps are condensed with it, CONDENSED at a time, which bounds
-    the cost of a pose. known, refused: landmarks of the newest submap and the open window that the
-    rest of the map has and contradicts. doubt: a warning about the last pose.
+    Without new priors the oldest submaps are condensed, CONDENSED at a time, which bounds the cost
+    of a pose. known, refused: landmarks of the newest submap and the open window that the rest of
+    the map contains, and contradicts. doubt: a warning about the last pose.
     """
 
     def __init__(self) -> None:
@@ -131,7 +130,7 @@ class TeamMap:
     def pose(
         self, prior: m.Prior, submaps: Sequence[LocalMap], window: RunningWindow | None
     ) -> Posed:
-        """The robot's pose in the team's frame after the open window.
+        """Estimate the robot's pose in the team's frame after the open window.
 
         A badly known heading gives the covariance of its arc.
         """
@@ -146,7 +145,7 @@ class TeamMap:
     def place(
         self, prior: m.Prior, own: OwnMap, window: RunningWindow | None
     ) -> PoseGaussian | None:
-        """Estimate the pose in the team's frame by a prior of landmarks alone; None where
+        """Estimate the pose in the team's frame by a prior of landmarks alone; None if
         undetermined.
         """
         from teamslam.team.estimation.map_joining.localising import locate_robot  # rarely needed
@@ -163,7 +162,7 @@ class TeamMap:
         return curved(posed.pose)
 
     def decode(self, prior: m.Prior) -> RobotPrior:
-        """The estimate in a prior; the last one is cached."""
+        """Return the estimate in a prior; the last one is cached."""
         if self._decoded is None or self._decoded[0] is not prior:
             self._decoded = prior, translate.prior_of(prior)
         return self._decoded[1]
@@ -184,8 +183,8 @@ class TeamMap:
     def join(self, prior: m.Prior, submaps: Sequence[LocalMap]) -> Followed:
         """Join the prior with the incarnation's submaps that it does not contain.
 
-        The prior may contain more submaps than a robot that has come back. Without a joint solution
-        the cached error is raised at every keyframe.
+        A restarted robot may have fewer submaps than the prior. Without a joint solution the cached
+        error is raised at every keyframe.
         """
         if self._followed is None or prior is not self._prior or len(submaps) != self._submaps:
             if prior is not self._prior or len(submaps) < self._submaps:

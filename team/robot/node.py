@@ -1,10 +1,10 @@
 """The robot's node: messages in, messages out; no I/O, no clock.
 
-    receive   handle        a message comes in
-    order     Inbox         measurements wait for their turn
+    receive   handle        a message arrives
+    order     Inbox         measurements are put in order
     estimate  Mapper.take   Hybrid-SLAM within the bounds of the sensor
     account   Ledger        law 1: each measurement is used once
-    publish   Mapper.out    submaps, poses, maps; then how far the robot is
+    publish   Mapper.out    submaps, poses, maps; then progress
 
 A robot is at most CREDIT_SUBMAPS submaps ahead of a present centre, and reports progress after each
 window and every PROGRESS_MEASUREMENTS measurements.
@@ -36,10 +36,11 @@ from teamslam.team.wire.digest import announce_configuration
 
 @dataclass
 class StreamAccount:
-    """The counts of the current incarnation, and the last statements of earlier ones.
+    """Counts of the current incarnation, and the last statements of earlier ones.
 
     consumed: measurements; steps: odometry intervals in this process; all_steps: of all
-    incarnations. acknowledged: by the centre. unreported: measurements since the last report.
+    incarnations. acknowledged: submaps at the centre. unreported: measurements since the last
+    report.
     """
 
     incarnation: int = 0
@@ -56,27 +57,23 @@ class StreamAccount:
         self.acknowledged, self.steps = acknowledged, 0
 
     def acknowledge(self, progress: m.Progress) -> None:
-        """Note the number of submaps that the centre has."""
+        """Record the number of submaps at the centre."""
         if progress.incarnation == self.incarnation:
             self.acknowledged = max(self.acknowledged, progress.submaps)
 
 
 AHEAD = 64
-"""Number of submaps of an earlier process that the centre may have taken since it was asked for
-them."""
-CREDIT_SUBMAPS = 4
-"""A robot is at most this many submaps ahead of a centre that is present."""
-PROGRESS_MEASUREMENTS = 64
-"""A robot reports its progress at least once per this many measurements."""
+"""Submaps of an earlier process that the centre may have received since the request for them."""
+CREDIT_SUBMAPS = 4  # most submaps that a robot is ahead of a present centre
+PROGRESS_MEASUREMENTS = 64  # most measurements between two reports of progress
 
 
 class RobotNode:
     """The node of one robot: call `begin`, then `handle` for every message, until `finished`.
 
     For recomputing a log: announced, the configuration's digest; poses, when and from which priors;
-    replaced, sent instead of a window; on_window receives each closed window. finished: `final`,
-    the team's final map, is there. withheld: number of messages that no receiver would have
-    accepted.
+    replaced, sent instead of a window; on_window receives each closed window. final: the team's
+    final map. withheld: number of messages that no receiver would accept.
     """
 
     listens: tuple[ch.Channel, ...] = (
@@ -129,17 +126,17 @@ class RobotNode:
 
     @property
     def incarnation(self) -> int:
-        """The current incarnation."""
+        """Current incarnation."""
         return self.inbox.incarnation
 
     @property
     def next_measurement(self) -> int:
-        """The counter of the next measurement."""
+        """Counter of the next measurement."""
         return self.inbox.next_measurement
 
     @property
     def submaps(self) -> int:
-        """Number of submaps of this incarnation that were sent, also earlier."""
+        """Number of sent submaps of this incarnation, with those of an earlier process."""
         return self.mapper.submaps.sent
 
     @property
@@ -148,7 +145,7 @@ class RobotNode:
         return (ch.RENDEZVOUS,) if self.mapper.submaps.buffers else ()
 
     def request(self) -> m.MeasurementsRequest | None:
-        """Missing measurements to request from their source."""
+        """Return the request for missing measurements, if any."""
         missing = self.stream_end.missing()
         if missing is None:
             return None
@@ -162,7 +159,7 @@ class RobotNode:
         )
 
     def status(self) -> m.Status:
-        """The robot's status, for people."""
+        """Return the robot's status for operators."""
         measurements = self.next_measurement
         return status_of(
             self.mapper,
@@ -174,11 +171,13 @@ class RobotNode:
         )
 
     def begin(self) -> list[Outgoing]:
-        """Make the first message: the configuration."""
+        """Return the first message: the configuration."""
         return [Outgoing(ch.ROBOT_CONFIG, self.robot, self._announcement)]
 
     def take_over(self, stored: Sequence[m.Message]) -> None:
-        """Continue where the centre's set of this robot ends, and answer for its submaps."""
+        """Continue where the centre's set of this robot ends, and answer requests for
+        its submaps.
+        """
         start = stored[0]
         assert isinstance(start, m.InitialPose)
         of_it = (
@@ -189,8 +188,8 @@ class RobotNode:
             self.mapper.submaps.restore(message)
 
     def resume(self, start: m.InitialPose, submaps: Sequence[m.Submap]) -> None:
-        """Continue after this robot's submaps of an earlier process: those of the latest
-        incarnation from sequence 0.
+        """Continue after an earlier process's submaps of the latest incarnation, from
+        sequence 0.
         """
         self.mapper.resume(start, submaps)
         used = submaps[-1].last_measurement + 1
@@ -198,11 +197,11 @@ class RobotNode:
         self.inbox.resume(start.incarnation, used)
 
     def answer_submaps(self, request: bytes) -> list[bytes]:
-        """Answer `SubmapsRequest` with everything sent for fusion, also earlier."""
+        """Answer `SubmapsRequest` with everything sent for fusion, by earlier processes too."""
         return self.mapper.submaps.answer(request)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Why a message cannot be true of this robot."""
+        """Return why a message cannot be valid for this robot, or None."""
         if m.is_measurement(message):  # first: most messages are measurements
             own = message.robot == self.robot
             return self.inbox.refusal(message) if own else f"a measurement of {message.robot}"
@@ -236,7 +235,7 @@ class RobotNode:
         return self._publish() if self.out else []
 
     def receive(self, message: m.Message) -> None:
-        """Take a message that is no measurement."""
+        """Process a message other than a measurement."""
         match message:
             case m.Prior():
                 self.out += self.mapper.poses.take_prior(message)
@@ -261,7 +260,7 @@ class RobotNode:
                 self.warnings.append(f"no use for a {type(message).__name__}")
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Continue behind a measurement whose handling raised, as if it had not come.
+        """Continue after a measurement whose handling raised, without it.
 
         The mapper is reset to its last submap and the window's other measurements, or ends with
         `Done` without its last window.
@@ -275,7 +274,7 @@ class RobotNode:
     # Order and estimate.
 
     def consume(self) -> None:
-        """Consume the measurements in turn, while credit lasts."""
+        """Consume the measurements in order, while credit lasts."""
         inbox = self.inbox
         while (inbox.ahead or inbox.later) and not self.is_held:
             measurement = inbox.take_next()
@@ -287,7 +286,7 @@ class RobotNode:
 
     @property
     def is_held(self) -> bool:
-        """Whether the robot waits for the credit of a present centre."""
+        """Whether the robot has used up its credit at a present centre."""
         if not self._centre_alive:
             return False
         return self.mapper.submaps.sent - self.account.acknowledged > CREDIT_SUBMAPS
@@ -311,7 +310,7 @@ class RobotNode:
             self.report_progress()
 
     def _publish(self) -> list[Outgoing]:
-        """Take the messages of `out` that every receiver accepts; withhold and name others.
+        """Return the messages of `out` that every receiver accepts; withhold others with a warning.
 
         Landmarks that rounding has made unsound are removed from a map.
         """
@@ -336,12 +335,12 @@ class RobotNode:
             self.report_progress()
 
     def report_progress(self) -> None:
-        """Publish how far the robot is."""
+        """Publish the robot's progress."""
         self.account.unreported = 0
         self.out.append(Outgoing(ch.ROBOT_PROGRESS, self.robot, self.progress()))
 
     def progress(self) -> m.Progress:
-        """Numbers of measurements consumed and submaps sent, and the time passed."""
+        """Return the numbers of consumed measurements and sent submaps, and the time passed."""
         since_ns = self.mapper.submaps.since_ns
         return m.Progress(
             stamp_ns=self.mapper.passed_ns if since_ns is None else since_ns,
@@ -371,7 +370,7 @@ class RobotNode:
             self.report_progress()
 
     def _finish(self) -> None:
-        """Finish with the last `Done` first, upon which the centre may conclude."""
+        """Finish with the last `Done` first, after which the centre may conclude."""
         self.done = True
         self._close_incarnation()
         self._send_last_words()
@@ -384,7 +383,7 @@ class RobotNode:
         self.out += (Outgoing(ch.ROBOT_DONE, self.robot, each) for each in statements)
 
     def statement(self) -> m.Done:
-        """The account of the incarnation up to its end."""
+        """Return the account of the incarnation up to its end."""
         account = self.account
         last = self.stream_end.last_of(account.incarnation)
         return m.Done(

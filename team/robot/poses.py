@@ -1,8 +1,7 @@
 """A robot's running poses: by its own measurements, and given the team's map.
 
 A pose on team/pose is in the team's frame while the newest prior is in the frame that it names.
-When a newer prior is in another frame, or withdraws, the own pose on team/pose replaces it for
-every receiver, late joiners included.
+When a newer prior is in another frame, or withdraws, the own pose replaces it on team/pose.
 """
 
 import math
@@ -25,33 +24,32 @@ from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.message_order import is_newer_prior
 
 TELLING = 3
-"""Fewest landmarks of a first pose, one less for each that is refused, among which a wrong range
-shows.
+"""Fewest landmarks of a first pose, one less for each that is refused, that reveal a
+wrong range.
 """
-PATIENCE_NS = 4_000_000_000
-"""Longest time that a first pose by fewer awaits them."""
+PATIENCE_NS = 4_000_000_000  # longest delay of a first pose by fewer landmarks
 
 
 @runtime_checkable
 class PoseEstimator(Protocol):
-    """The estimates of a mapper that make a pose."""
+    """Estimates of a mapper that make a pose."""
 
     writer: MessageWriter
     submaps: Submaps
 
     @property
     def sequence(self) -> int:
-        """The number of the open window."""
+        """Number of the open window."""
 
     def open_window(self) -> RunningWindow | None:
-        """Gaussian of the open window."""
+        """Return the Gaussian of the open window."""
 
     def own_pose(self, window: RunningWindow | None) -> PoseGaussian:
-        """The pose by own measurements."""
+        """Return the pose by own measurements."""
 
 
 class RunningPoses:
-    """Publishes poses every `pose_s`.
+    """Poses published every `pose_s`.
 
     sigma_m: of the last pose in the team's frame; 0 without.
     """
@@ -73,7 +71,7 @@ class RunningPoses:
         self.sigma_m = 0.0
 
     def take_prior(self, prior: m.Prior) -> list[Outgoing]:
-        """Take a prior from the team's map; return the message that withdraws the last pose, if in
+        """Store a prior from the team's map; return the message that withdraws a last pose in
         another frame.
         """
         if not is_newer_prior(prior, self._prior):
@@ -88,7 +86,7 @@ class RunningPoses:
         return [] if prior.ids and prior.frame == self._claimed else self._withdrawn_pose()
 
     def _withdrawn_pose(self) -> list[Outgoing]:
-        """The own pose on team/pose, if the last one is not in the prior's frame."""
+        """Return the own pose for team/pose, if the last one is not in the prior's frame."""
         prior = self._prior
         if prior is None:
             return []
@@ -108,19 +106,21 @@ class RunningPoses:
         return self._prior is not None and self._prior.in_team_frame
 
     def prior_of(self, incarnation: int) -> m.Prior | None:
-        """The prior with a pose of this incarnation."""
+        """Return the prior with a pose of this incarnation."""
         prior = self._prior if self.has_prior else None
         return prior if prior is not None and prior.incarnation == incarnation else None
 
     def _placing(self, incarnation: int) -> m.Prior | None:
-        """The newest prior if it places this incarnation, be it by landmarks alone."""
+        """Return the newest prior if it places this incarnation, by a pose or by
+        landmarks alone.
+        """
         prior = self._prior
         if prior is None or prior.incarnation != incarnation:
             return None
         return prior if prior.in_team_frame or prior.ids else None
 
     def begin_incarnation(self, incarnation: int) -> None:
-        """Forget the prior of an earlier incarnation."""
+        """Drop the prior of an earlier incarnation."""
         self._pair_ns = None
         if self._prior is not None and self._prior.incarnation < incarnation:
             self._prior = None
@@ -140,7 +140,9 @@ class RunningPoses:
         return out
 
     def _awaits_more(self, stamp_ns: int) -> bool:
-        """Whether a first pose by landmarks alone needs another landmark to show a wrong one."""
+        """Return whether a first pose by landmarks alone needs another landmark to reveal a wrong
+        one.
+        """
         is_placed = self.has_prior or self._claimed is not None
         if is_placed or self.team_map.known - 2 * self.team_map.refused >= TELLING:
             return False
@@ -174,7 +176,7 @@ class RunningPoses:
 
 
 def outside_team_frame(own: Outgoing) -> Outgoing:
-    """The own pose as a message on team/pose that withdraws earlier poses."""
+    """Make the message of the own pose on team/pose that withdraws earlier poses."""
     assert isinstance(own.message, m.PoseEstimate)
     message = msgspec.structs.replace(own.message, in_team_frame=False)
     return Outgoing(ch.TEAM_POSE, own.name, message)

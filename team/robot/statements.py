@@ -1,4 +1,4 @@
-"""Writes a robot's estimates as messages."""
+"""Write a robot's estimates as messages."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,9 +23,9 @@ from teamslam.team.wire.digest import NO_MAP
 
 @dataclass(frozen=True)
 class MessageWriter:
-    """Writes the messages of one incarnation under a configuration's digest.
+    """Writer of one incarnation's messages under a configuration's digest.
 
-    started: whether its initial pose is known.
+    started: its initial pose is known.
     """
 
     robot: str
@@ -34,7 +34,7 @@ class MessageWriter:
     started: bool
 
     def submap(self, closed: ClosedWindow) -> m.Submap:
-        """The window's Gaussian with its inputs."""
+        """Write the window's Gaussian with its inputs."""
         return translate.submap_message(
             robot=self.robot,
             incarnation=self.incarnation,
@@ -48,7 +48,7 @@ class MessageWriter:
         )
 
     def association(self, sequence: int, stamp_ns: int, became: Became) -> Outgoing:
-        """Outcomes of the window's detections without identities."""
+        """Write the outcomes of the window's detections without identities."""
         landmarks = np.where(became.clutter, m.CLUTTER, m.UNCONFIRMED)
         message = m.Association(
             stamp_ns=stamp_ns,
@@ -63,7 +63,7 @@ class MessageWriter:
         return Outgoing(ch.ASSOCIATION, self.robot, message)
 
     def sighting(self, sequence: int, each: NodeSighting) -> m.SightingFactor:
-        """The inter-robot measurement from a window's pose node, with its inputs."""
+        """Write the inter-robot measurement from a window's pose node, with its inputs."""
         return m.SightingFactor(
             stamp_ns=each.stamp_ns,
             robot=self.robot,
@@ -79,13 +79,13 @@ class MessageWriter:
         )
 
     def cloud(self, stamp_ns: int, cloud: Cloud) -> Outgoing:
-        """The thinned particles at this time."""
+        """Write the thinned particles."""
         poses, weights = (from_floats(x) for x in cloud)
         message = m.ParticleCloud(stamp_ns=stamp_ns, robot=self.robot, poses=poses, weights=weights)
         return Outgoing(ch.PARTICLES, self.robot, message)
 
     def innovation(self, stamp_ns: int, sequence: int, found: Innovation) -> Outgoing:
-        """The innovations of a window, or since the last such message."""
+        """Write the innovations of a window, or since the last such message."""
         message = m.Innovation(
             stamp_ns=stamp_ns,
             robot=self.robot,
@@ -104,7 +104,7 @@ class MessageWriter:
         landmarks: LandmarkGaussian,
         kind: Literal["joint", "blocks"],
     ) -> Outgoing:
-        """The running map, with joint or separate covariances."""
+        """Write the running map, with joint or separate covariances."""
         joint = kind == "joint"
         message = m.MapEstimate(
             stamp_ns=stamp_ns,
@@ -126,8 +126,8 @@ class MessageWriter:
     def pose(
         self, stamp_ns: int, sequence: int, pose: PoseGaussian, prior: m.Prior | None = None
     ) -> Outgoing:
-        """A running pose by own measurements, in the stream's start frame; given the team's map, in
-        the prior's frame.
+        """Write a running pose by own measurements, in the stream's start frame; given the team's
+        map, in the prior's frame.
         """
         mean, covariance = core.pose_bytes(*pose)
         message = m.PoseEstimate(

@@ -1,4 +1,4 @@
-"""A robot's status, for people, with its warnings."""
+"""A robot's status and warnings, for operators."""
 
 from typing import Literal
 
@@ -9,14 +9,14 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 
 UNEXPECTED = 3.0
-"""NIS per degree of freedom above which measurements contradict the models: 1 is right, and
-5 % of outliers give 3 with a coarse sensor, a hundred with an accurate one."""
-UNEXPECTED_DOF = 60
-"""… computed from this many degrees of freedom at least."""
+"""NIS per degree of freedom above which measurements contradict the models: 1 is right; 5 % of
+outliers give 3 with a coarse sensor, 100 with an accurate one.
+"""
+UNEXPECTED_DOF = 60  # least degrees of freedom for this warning
 
 
 def unexpected(nis: Innovation, estimator: Estimator) -> tuple[str, ...]:
-    """Warn of measurements far from their predictions, and name the settings."""
+    """Warn of measurements far from their predictions, with the settings to check."""
     ratio = nis.per_dof
     if ratio is None or ratio < UNEXPECTED or nis.dof < UNEXPECTED_DOF:
         return ()
@@ -40,7 +40,7 @@ def status_of(
 ) -> m.Status:
     """Make a robot's status from its counts of intervals and measurements.
 
-    withheld: number of messages that no receiver would have accepted.
+    withheld: number of messages that no receiver would accept.
     """
     config, poses, submaps, nis = mapper.config, mapper.poses, mapper.submaps, mapper.innovation
     figures = {

@@ -12,17 +12,15 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.message_order import later_head, merge_ends
 
-NEAR_LIVES = 16
-"""Largest accepted step of the incarnation, which grows one by one, and seldom."""
+NEAR_LIVES = 16  # largest accepted step of the incarnation
 
 
 class Inbox:
-    """Hold measurements until their turn: Zenoh guarantees no order across keys.
+    """Order of a robot's measurements, since Zenoh guarantees none across keys.
 
     Duplicates and earlier incarnations are dropped. A later incarnation begins with its measurement
-    0.
-
-    ahead: waiting measurements of the incarnation, by number. later: those of later incarnations.
+    0. ahead: waiting measurements of the incarnation, by number. later: those of later
+    incarnations.
     """
 
     def __init__(self) -> None:
@@ -35,7 +33,7 @@ class Inbox:
         self._of_source: set[int] = set()
 
     def confirm(self, measurement: m.Measurement) -> None:
-        """Confirm a measurement by the source's answer."""
+        """Mark a measurement as confirmed by its source."""
         if measurement.incarnation == self.incarnation:
             self._of_source.add(measurement.number)
 
@@ -62,7 +60,7 @@ class Inbox:
             self.ahead[measurement.number] = measurement
 
     def refusal(self, measurement: m.Measurement) -> str | None:
-        """Why a measurement cannot belong to this stream.
+        """Return why a measurement cannot belong to this stream, or None.
 
         Incarnations follow one another and begin with their only initial pose, the earliest stamp.
         """
@@ -82,7 +80,7 @@ class Inbox:
         return None if number in self._of_source else another_time(measurement.stamp_ns, began_ns)
 
     def contradicts(self, end: m.End, robot: str) -> str | None:
-        """Why an announced end contradicts the stream."""
+        """Return why an announced end contradicts the stream, or None."""
         ends = {
             stream.incarnation: stream.measurements
             for stream in end.streams
@@ -99,7 +97,7 @@ class Inbox:
         return None
 
     def take(self, measurement: m.Measurement) -> bool:
-        """Take a measurement whose turn it is, as most are; False: it must wait (`put`)."""
+        """Consume a measurement that is next, as most are; False if it must be stored (`put`)."""
         number = measurement.number
         if (
             number != self.next_measurement
@@ -114,7 +112,7 @@ class Inbox:
         return True
 
     def take_next(self) -> m.Measurement | None:
-        """Remove and return the measurement whose turn has come."""
+        """Remove and return the next measurement."""
         while True:
             measurement = self.ahead.pop(self.next_measurement, None)
             if measurement is not None:
@@ -133,7 +131,7 @@ class Inbox:
             self._forget(following)
 
     def _forget(self, incarnation: int) -> None:
-        """Drop measurements whose turn cannot come after this incarnation."""
+        """Drop measurements that cannot follow this incarnation."""
         self._received = 0
         self._of_source.clear()
         self.later = {e: measurements for e, measurements in self.later.items() if e > incarnation}
@@ -166,15 +164,16 @@ class Inbox:
         return (following, 0, first - 1) if first else None
 
     def complete(self, end: m.StreamEnd) -> bool:
-        """Whether the whole stream has been consumed."""
+        """Return whether the whole stream has been consumed."""
         return end.measurements == 0 or (
             self.incarnation == end.incarnation and self.next_measurement >= end.measurements
         )
 
     def missing(self, end: m.StreamEnd | None) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement to request: a gap, or everything up to the end.
+        """Return incarnation, first and last measurement to request: a gap, or everything up to the
+        end.
 
-        The source has nothing after the end, nor of incarnations but the present and the last.
+        The source has nothing after the end, and no incarnations but the present and the last.
         """
         gap = self.gap
         if end is None:
@@ -211,7 +210,7 @@ class EndOfStream:
         """Incarnation and measurements at which a world ends the stream, by its own answer."""
 
     def is_reached(self) -> bool:
-        """Whether every measurement up to the last one has been consumed.
+        """Return whether every measurement up to the last one has been consumed.
 
         An ending live team ends the stream of an absent driver where it is.
         """
@@ -222,7 +221,7 @@ class EndOfStream:
         return self._inbox.complete(self._last)
 
     def last_of(self, incarnation: int) -> int | None:
-        """The number of measurements of an incarnation that has ended."""
+        """Return the number of measurements of an incarnation that has ended."""
         last = self._last
         return last.measurements if last is not None and last.incarnation == incarnation else None
 
@@ -233,7 +232,7 @@ class EndOfStream:
         return driven and self.driver_is_there is False
 
     def missing(self) -> tuple[int, int, int] | None:
-        """Incarnation, first and last measurement to request."""
+        """Return incarnation, first and last measurement to request."""
         return None if self.waits_for_driver else self._inbox.missing(self._known())
 
     def _known(self) -> m.StreamEnd | None:
@@ -245,12 +244,14 @@ class EndOfStream:
         )
 
     def announced_by(self, end: m.End) -> tuple[int, int]:
-        """Incarnation and measurements at which an announced end ends this stream; 0 if unnamed."""
+        """Return incarnation and measurements at which an announced end ends this stream; 0 if
+        unnamed.
+        """
         ends = [(s.incarnation, s.measurements) for s in end.streams if s.robot == self._robot]
         return ends[0] if ends else (self._inbox.incarnation, 0)
 
     def refusal(self, message: m.End | m.StreamHead) -> str | None:
-        """Why an announced end cannot be true of the stream."""
+        """Return why an announced end cannot be valid for the stream, or None."""
         if isinstance(message, m.End):
             of_source = self.at_source in _ends_of(message, self._robot)
             return None if of_source else self._inbox.contradicts(message, self._robot)
@@ -260,7 +261,7 @@ class EndOfStream:
         return self._inbox.contradicts(_end_at(message), self._robot) if ended else None
 
     def receive(self, message: m.Liveliness | m.End | m.TeamEnd) -> None:
-        """Take the driver's presence, a world's end or an order to end."""
+        """Process the driver's presence, a world's end or an order to end."""
         match message:
             case m.Liveliness():
                 if message.node == ch.source_node(self._robot):
@@ -271,7 +272,7 @@ class EndOfStream:
                 self.is_ordered = True
 
     def take(self, end: m.End) -> None:
-        """Take a world's end; one without this robot ends its stream here."""
+        """Process a world's end; one without this robot ends its stream here."""
         self._world_end = end = merge_ends(end, self._world_end)
         mine = [stream for stream in end.streams if stream.robot == self._robot]
         if self.at_source is not None:  # no other word counts any more
@@ -281,9 +282,8 @@ class EndOfStream:
         self._last = mine[0] if mine else self._at(0)
 
     def take_head(self, head: m.StreamHead) -> m.StreamHead:
-        """Take the driver's newest head.
-
-        It may end the stream, unless a later incarnation begins.
+        """Process the driver's newest head, which may end the stream or begin a later
+        incarnation.
         """
         self._head = head = later_head(head, self._head)
         if self.at_source is not None:

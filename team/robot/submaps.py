@@ -1,4 +1,4 @@
-"""The robot's submaps, each held once, as its message's payload.
+"""The robot's submaps, each stored once, as its message's payload.
 
 A restarted centre may request all of them (`SubmapsRequest`); the pose in the team's map decodes
 the few that it needs.
@@ -28,19 +28,18 @@ _SUBMAP = msgspec.msgpack.Decoder(m.Submap)
 
 @dataclass
 class _Stream:
-    """The payloads of one incarnation: submaps and their factors, by sequence."""
+    """Payloads of one incarnation: submaps and their factors, by sequence."""
 
     start: bytes | None = None
     submaps: dict[int, bytes] = field(default_factory=dict)
     factors: dict[int, list[bytes]] = field(default_factory=dict)
 
     def submap(self, sequence: int) -> m.Submap:
-        """The message of a submap."""
         message: m.Submap = _SUBMAP.decode(self.submaps[sequence])
         return message
 
     def between(self, first: int, end: int) -> Iterator[bytes]:
-        """The factors, then the submaps, in [first, end)."""
+        """Yield the factors, then the submaps, in [first, end)."""
         for sequence in sorted(self.factors):
             if first <= sequence < end:
                 yield from self.factors[sequence]
@@ -50,8 +49,8 @@ class _Stream:
 class Submaps(Sequence[LocalMap]):
     """The messages for fusion of one robot, and its incarnation's submaps as a sequence of maps.
 
-    Items have the landmarks with identities, and are decoded when read. buffers: whether submaps
-    wait for an encounter. sent: number of those sent, also earlier.
+    Items have the landmarks with identities, and are decoded when read. buffers: submaps wait for
+    an encounter. sent: number of those sent, with those of an earlier process.
     """
 
     def __init__(self, robot: str, exchange: Exchange) -> None:
@@ -105,13 +104,13 @@ class Submaps(Sequence[LocalMap]):
 
     @property
     def last(self) -> m.Submap | None:
-        """The newest submap of the incarnation."""
+        """Newest submap of the incarnation."""
         return self._newest.submap(len(self) - 1) if len(self) else None
 
     def release(self, seen: tuple[str, ...], now_ns: int) -> list[Outgoing]:
-        """Release the buffered messages behind an announcement, at an encounter or the end.
+        """Release the buffered messages after an announcement, at an encounter or the end.
 
-        seen: the teammates that are to release theirs, too. Nothing where no message would be new.
+        seen: teammates that are to release theirs, too. Empty if no message would be new.
         """
         stream, buffered = self._newest, range(self.sent, len(self))
         if not self.buffers or not (buffered or set(seen) - self._greeted):
@@ -134,12 +133,12 @@ class Submaps(Sequence[LocalMap]):
         return released
 
     def answer(self, request: bytes) -> list[bytes]:
-        """Answer with everything sent for fusion, also earlier."""
+        """Answer with everything sent for fusion, by earlier processes too."""
         requested = decoded(request, m.SubmapsRequest)
         return [*self._answer(requested)] if requested.robot == self._robot else []
 
     def _answer(self, request: m.SubmapsRequest) -> Iterator[bytes]:
-        """Each incarnation's initial pose, then factors and submaps by sequence."""
+        """Yield each incarnation's initial pose, then factors and submaps by sequence."""
         every = request.incarnation == 0
         for incarnation in sorted(self._streams) if every else [request.incarnation]:
             stream = self._streams.get(incarnation, _Stream())
@@ -156,7 +155,7 @@ class Submaps(Sequence[LocalMap]):
     @overload
     def __getitem__(self, index: slice) -> list[LocalMap]: ...
     def __getitem__(self, index: int | slice) -> LocalMap | list[LocalMap]:
-        """The local maps of submaps of this incarnation, decoded."""
+        """Decode the local maps of this incarnation's submaps."""
         numbers = range(len(self))[index]
         if isinstance(numbers, int):
             return translate.local_map_of(self._newest.submap(numbers)).named
