@@ -357,3 +357,35 @@ def test_an_entry_returns_or_refuses_its_arguments(name):
         with suppress(ValueError, TypeError):  # LinAlgError is one
             at = getattr(core, of_class)(**of_owner) if of_owner else owner()
             call(name, arguments, at)
+
+
+def test_any_stream_of_intervals_and_scans_makes_keyframes_that_a_window_takes():
+    rng = np.random.default_rng(1)
+
+    def number(usual: float) -> float:
+        return usual if rng.random() < 0.95 else float(one_of(NUMBERS, rng))
+
+    for _ in range(DRAWS):
+        segmenter, opened, now_ns = made("Segmenter"), made("OpenWindow"), 0
+        for _ in range(40):
+            count, duration_ns = int(rng.integers(4)), int(rng.integers(10**9))
+            seen = np.array([[number(rng.uniform(0.5, 9.0)) for _ in range(count)] for _ in "rb"])
+            ids = rng.integers(6, size=count).astype(np.uint32)
+            parts = [row.tobytes() for row in seen]
+            named, unnamed = core.Scan.polar(ids.tobytes(), *parts), core.Scan.unnamed(*parts)
+            scan = named if rng.random() < 0.7 else unnamed
+            segmenter.observe(now_ns + int(rng.integers(-(10**9), 10**9)), scan)
+            segmenter.stop_at(now_ns + int(rng.integers(2 * 10**9)))
+            now_ns += duration_ns if rng.random() < 0.9 else one_of([-duration_ns, 10**15], rng)
+            segmenter.drive(now_ns, duration_ns, number(0.5), number(0.1))
+            if segmenter.is_stopped:
+                one_of([segmenter.reach_node, segmenter.mark_sighting], rng)()
+                segmenter.stop_at(2**62)
+                segmenter.go_on()
+            opened.advance_by(segmenter)
+        rest = segmenter.cut(now_ns)
+        opened.advance_by(segmenter)
+        opened.confirm()
+        opened.move(rest)
+        assert len(opened.accepted()) <= len(opened.keyframes_ns)
+        assert segmenter.leave() >= segmenter.uncovered == 0
