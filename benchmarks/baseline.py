@@ -24,7 +24,7 @@ class Held(NamedTuple):
 
     @property
     def is_worse(self) -> bool:
-        """Beyond its bound, or NaN."""
+        """Whether the figure is beyond its bound, or NaN."""
         within = self.value <= self.bound if self.better == "less" else self.value >= self.bound
         return not within
 
@@ -54,7 +54,7 @@ def find_worse(figures: Mapping[str, float], name: str) -> list[str]:
 def conclude(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
     """Print the figures, write them to `file`, and compare them with the baseline.
 
-    wrong: further faults. Returns the exit status: 1 for any fault.
+    wrong: further faults. Returns the exit status, 1 for any fault.
     """
     text = json.dumps(figures, indent=1)
     print(text)

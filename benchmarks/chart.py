@@ -16,7 +16,7 @@ from benchmarks.baseline import baselines
 
 
 def draw_baselines(picture: Path) -> None:
-    """A row per figure: a point at 1, a line to the worst allowed."""
+    """Draw a row per figure: a point at 1, a line to the worst allowed."""
     rows = [
         (f"{name}: {figure} ({of['value']:g})", of)
         for name, told in baselines().items()

@@ -16,7 +16,6 @@ from benchmarks.baseline import Held, baselines, compare_figures
 
 
 def run_benchmark(name: str, command: str, output: Path) -> dict[str, float]:
-    """Run a benchmark; status 1: some figures are worse."""
     page = output / f"{name}.json"
     page.unlink(missing_ok=True)
     program, *options = shlex.split(command)

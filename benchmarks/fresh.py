@@ -27,7 +27,9 @@ Submap = tuple[str, int, int]
 
 
 def measure_latency(log: Path) -> dict[str, Any]:
-    """Seconds until the map and until a teammate's prior; round trip and solution time."""
+    """Measure the seconds until the map and until a teammate's prior, round trip and
+    solution time.
+    """
     arrived: dict[Submap, float] = {}
     mapped: dict[Submap, float] = {}
     told: dict[Submap, float] = {}
@@ -97,7 +99,6 @@ def launch_run(folder: Path) -> Path:
 
 
 def main() -> int:
-    """Measure and print; without a log, compare an own run with the baseline."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("logs", nargs="*", type=Path)
     parser.add_argument("--json", type=Path)

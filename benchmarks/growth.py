@@ -54,7 +54,7 @@ BASELINES: Mapping[tuple[int, int, int, str | None], str] = {
 
 
 class World:
-    """Landmarks in a square, and robots on random paths; submaps tick by tick."""
+    """Landmarks in a square, and robots on random paths, which yield submaps tick by tick."""
 
     def __init__(self, robots: int, landmarks: int, seed: int = 1, hidden: bool = False) -> None:
         self.hidden = hidden
@@ -113,7 +113,7 @@ class World:
         return translate.submap_message(f"r{r}", 1, k, counters, ends, bytes(8), local)
 
     def window(self) -> Scans:
-        """One robot's detections in a window of WINDOW scans."""
+        """Draw one robot's detections in a window of WINDOW scans."""
         rng, pose = self._rng, self._poses[0]
         offsets = self.landmarks - pose[:2]
         seen = offsets[np.hypot(*offsets.T) < self._reach]
@@ -137,7 +137,7 @@ def resident_mb() -> float:
 
 
 def window_ms(world: World) -> float:
-    """CPU time of a window's association, the median of five windows."""
+    """Measure the CPU time of a window's association, the median of five windows."""
     spent = []
     for _ in range(5):
         scans = world.window()
@@ -207,7 +207,7 @@ def _count_landmarks(out: list[Outgoing]) -> int:
 
 
 def figures(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Figures of the baseline: the largest size, and its ratio to 500 submaps or the least."""
+    """Return the figures of the largest size, and their ratios to 500 submaps or the least."""
     last = rows[-1]
     base = next((row for row in rows if row["submaps"] >= 500), rows[0])
     before = rows[-2] if len(rows) > 1 else rows[0]

@@ -42,7 +42,6 @@ def drive(count: int) -> list[ros.Message]:
 
 
 def plain_s(bag: Path) -> float:
-    """Seconds to read and deserialise everything."""
     began = time.perf_counter()
     with AnyReader([bag], default_typestore=types()) as reader:
         for connection, _, data in reader.messages():
@@ -58,7 +57,7 @@ def imported_s(bag: Path, folder: Path) -> float:
 
 
 def damaged(count: int) -> tuple[int, int, float]:
-    """Numbers of refused payloads and of other errors, and the seconds taken."""
+    """Count refused payloads and other errors, and measure the seconds."""
     chance = random.Random(0)
     sound = [(kind, ros.cdr(kind, SAMPLES[kind])) for kind in READERS]
     refused = wrong = 0

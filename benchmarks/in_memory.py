@@ -36,7 +36,7 @@ MEASURED = "50,400"
 
 
 def scaled(robots: int, steps: int) -> Scenario:
-    """`random-50` with so many robots at the same density."""
+    """Scale `random-50` to so many robots at the same density."""
     scenario = with_options(load("random-50"), robots=robots)
     world = scenario.world
     assert isinstance(world, SimulatedWorld)

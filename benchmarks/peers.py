@@ -55,8 +55,8 @@ def submap(robot: str, sequence: int) -> m.Submap:
 
 
 def reach_of(topology: str, robots: int) -> Reach:
-    """Reach by topology: all, along a line or a ring, in pairs for 5 s a minute, or two halves cut
-    for 100 s.
+    """Make the reach of a topology: all, along a line or a ring, in pairs for 5 s a minute, or two
+    halves cut for 100 s.
     """
 
     def index(name: str) -> int:
@@ -114,7 +114,7 @@ class Team:
             heapq.heappush(self._way, (at_ns + WAY_NS, self._count, sender, to, what))
 
     def spread(self, name: str, out: list[Outgoing], now_ns: int) -> None:
-        """Send a node's messages: a request to one node, others to everyone in reach."""
+        """Send a node's messages: a request to one node, others to every node in reach."""
         for each in out:
             size = len(encoded(each.message))
             self.said[name] += size
@@ -140,7 +140,7 @@ class Team:
                 self.send(name, other, member, now_ns)
 
     def talk(self, now_ns: int, length_ns: int) -> None:
-        """Exchange the peers' due messages, and deliver those that arrive within the time."""
+        """Exchange the peers' due messages; deliver those that arrive within the time."""
         for name, node in self.nodes.items():
             self.spread(name, node.tick(now_ns * 1e-9), now_ns)
         while self._way and self._way[0][0] < now_ns + length_ns:
@@ -148,7 +148,7 @@ class Team:
             self._arrive(sender, to, what, at_ns)
 
     def held(self, aims: Mapping[str, int]) -> dict[str, int]:
-        """Number of the first `aims` submaps of each robot that each node has."""
+        """Count the first `aims` submaps of each robot that each node has."""
         return {
             name: sum(min(node.replica.share_of((r, 1)).count, n) for r, n in aims.items())
             for name, node in self.nodes.items()
@@ -171,7 +171,6 @@ class Team:
 
     @property
     def agrees(self) -> bool:
-        """Whether all sets are equal."""
         return len({node.replica.digest for node in self.nodes.values()}) == 1
 
 

@@ -40,7 +40,7 @@ STEPPED = 60
 
 
 def least(parts: list[Callable[[], None]], rounds: int) -> list[float]:
-    """CPU seconds of each part, the least of all rounds; the parts alternate."""
+    """Measure the CPU seconds of each part, the least of all rounds; the parts alternate."""
     took = [[_cpu_s(part) for part in parts] for _ in range(rounds + 1)]
     return np.min(took[1:], axis=0).tolist()  # the first round loads
 
@@ -66,7 +66,7 @@ def composed_in_a_run() -> None:
 
 
 def steps() -> list[Callable[[], None]]:
-    """A step of FastSLAM 1.0 and of 2.0, and the innovation before it, thirty times each."""
+    """Make a step of FastSLAM 1.0, one of 2.0, and the innovation before it, thirty times each."""
     rng = np.random.default_rng(1)
     landmarks = rng.uniform(-20.0, 20.0, (KNOWN, 2))
     spread = np.zeros((PARTICLES, KNOWN, 3))
@@ -99,7 +99,7 @@ def steps() -> list[Callable[[], None]]:
 def driving(
     front_end: FrontEnd, intervals: int, interval_ns: int, every: int, ranges: list[float]
 ) -> Callable[[], None]:
-    """A node over odometry intervals, with a scan before the first one of every few."""
+    """Make a node's step over odometry intervals, with a scan before the first one of every few."""
     config = RobotConfig("r1", MOTION, SENSOR, front_end)
     start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
     ids = np.arange(1, len(ranges) + 1, dtype=np.uint32)

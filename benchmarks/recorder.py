@@ -36,7 +36,7 @@ _COMMAND = [sys.executable, "-m", "teamslam"]
 
 
 def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds: float) -> None:
-    """Publish each robot's measurements on time in a process; print counts by key."""
+    """Publish each robot's measurements on time, in a process of its own; print counts by key."""
     rng = np.random.default_rng(0)
     period_ns = round(1e9 / hz)
     counts: dict[str, int] = {}
@@ -80,7 +80,7 @@ def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds:
 
 
 def cpu_s(pid: int) -> float:
-    """CPU time of a process so far; Linux."""
+    """Read the CPU time of a process (Linux)."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -176,7 +176,7 @@ def _wait_for_recorder(bus: ZenohBus) -> None:
 
 
 def _no_map() -> m.FusedMap:
-    """Message after which a recorder without a team ends."""
+    """Make the message after which a recorder without a team ends."""
     empty = from_floats([])
     return m.FusedMap(
         stamp_ns=0,

@@ -31,7 +31,7 @@ def read_plainly(path: Path) -> tuple[int, float]:
 
 
 def figures(path: Path) -> dict[str, Any]:
-    """Figures of one log, in CPU time of this process."""
+    """Measure one log, in CPU time of this process."""
     log = open_log(path)
     messages, measurement_s = read_plainly(log.path)
     began = time.process_time()

@@ -69,7 +69,7 @@ def serve(folder: Path | None) -> None:
 
 
 def take(endpoint: str, folder: Path | None, count: int) -> None:
-    """Receive in a process: answer each progress, count observations."""
+    """Receive in a process of its own: answer each progress, count observations."""
     with enter_team(endpoint, folder, "robot-r1") as bus:
         bus.subscribe(ch.OBSERVATIONS, "r1")
         bus.subscribe(ch.END)
@@ -94,7 +94,7 @@ def take(endpoint: str, folder: Path | None, count: int) -> None:
 
 
 def link(folder: Path | None, count: int) -> tuple[float, float]:
-    """Messages per second, and median round trip [s]."""
+    """Measure messages per second and the median round trip [s]."""
     more = [] if folder is None else ["--keys", str(folder)]
     hub = subprocess.Popen(
         [*_HERE, "--serve", *more], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -120,7 +120,7 @@ def link(folder: Path | None, count: int) -> tuple[float, float]:
 
 
 def ping(bus: ZenohBus, stamp_ns: int) -> float:
-    """One round trip; sent again while the link is coming up."""
+    """Measure one round trip; send again while the link comes up."""
     began = time.perf_counter()
     bus.publish(Outgoing(ch.END, "", m.End(stamp_ns=stamp_ns, streams=())))
     while True:
@@ -132,7 +132,7 @@ def ping(bus: ZenohBus, stamp_ns: int) -> float:
 
 
 class Sink:
-    """A node that does nothing."""
+    """Node without effect."""
 
     taken = 0
 
@@ -142,7 +142,9 @@ class Sink:
 
 
 def measure_boundary(count: int) -> tuple[float, float]:
-    """CPU seconds per message of a node: without, and with the boundary; the least of turns."""
+    """Measure the CPU seconds per message of a node, without and with the boundary, the least of
+    turns.
+    """
     samples = [
         Sample(ch.OBSERVATIONS.key("r1"), encoded(observations(i)), i, 0, i) for i in range(count)
     ]
@@ -168,7 +170,7 @@ def measure_boundary(count: int) -> tuple[float, float]:
 
 
 def measure_security(count: int, rounds: int) -> dict[str, Any]:
-    """Medians over rounds of all halves, and ratios of these medians."""
+    """Return medians over rounds of all halves, and ratios of these medians."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         keys = Path(folder)

@@ -29,7 +29,6 @@ from teamslam.team.wire.channels import SENSORS
 
 
 def launch_team(scenario: Scenario, folder: Path) -> dict[str, Any]:
-    """Figures of one launch."""
     folder.mkdir()
     plan = Plan(
         scenario=scenario,
@@ -62,7 +61,7 @@ def command_first_s(words: list[str], folder: Path) -> float:
 
 
 def measure_idle(folder: Path) -> dict[str, dict[str, float]]:
-    """Resources of a router, a recorder and a robot, ready and idle."""
+    """Measure the resources of a router, a recorder and a robot, ready and idle."""
     folder.mkdir()
     log = str(folder / "log.mcap")
     words = {
@@ -95,7 +94,7 @@ def await_line(process: "subprocess.Popen[str]", words: str) -> str:
 
 
 def measure_at_rest(pid: int) -> dict[str, float]:
-    """Memory and CPU of a process at rest: below a tenth of a core for a second."""
+    """Measure memory and CPU of a process at rest: below a tenth of a core for a second."""
     ticks = [-100]
     while ticks[-1] - ticks[0] > 10 or len(ticks) < 2:
         time.sleep(1.0)
@@ -108,7 +107,7 @@ def measure_at_rest(pid: int) -> dict[str, float]:
 
 
 def bare_cpu_s() -> float:
-    """Least CPU of three starts of Python with NumPy."""
+    """Measure the least CPU of three starts of Python with NumPy."""
     took = []
     for _ in range(3):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)

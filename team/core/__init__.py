@@ -1,8 +1,8 @@
-"""The native core: the numerical state of a window, and functions with defined bits.
+"""Native core: the numerical state of a window, and functions with defined bits.
 
-Two builds, for x86-64 of the last decade and with AVX2, give the same bits. The better one that the
-processor has is imported; the environment variable TEAMSLAM_CORE (base or avx2) overrides the
-choice (docs/core.md).
+Two builds, for x86-64 of the last decade and with AVX2, give the same bits. The best one for the
+processor is imported; the environment variable TEAMSLAM_CORE (base or avx2) overrides the choice
+(docs/core.md).
 """
 
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def _levels() -> tuple[str, ...]:
-    """List the levels that this processor can run, the best first."""
+    """List the levels of this processor, the best first."""
     if chosen := os.environ.get("TEAMSLAM_CORE"):
         return (chosen,)
     try:
@@ -24,7 +24,6 @@ def _levels() -> tuple[str, ...]:
 
 
 def _import_library() -> None:
-    """Import the library of the best level as `teamslam.team.core._core`."""
     for each in _levels():
         try:
             sys.modules[f"{__name__}._core"] = import_module(f"{__name__}._core_{each}")

@@ -55,7 +55,6 @@ def find_compiler() -> str | None:
 
 
 def _works(compiler: str) -> bool:
-    """Whether the compiler and its library have what the core uses of C++20."""
     command = [compiler, "-std=c++20", "-fsyntax-only", "-x", "c++", "-"]
     tried = subprocess.run(command, input=C20.encode(), capture_output=True, check=False)  # noqa: S603
     return not tried.returncode
@@ -112,7 +111,9 @@ def known_levels() -> tuple[str, ...]:
 
 
 def chosen_levels(settings: Settings) -> list[str] | None:
-    """Levels that the settings name, `own` resolved; None: all. An unknown one ends the build."""
+    """Return the levels that the settings name, `own` resolved; None: all. An unknown one ends the
+    build.
+    """
     named = (settings or {}).get(LEVELS)
     if named is None:
         return None

@@ -3,8 +3,7 @@
 The patch, the landmarks of a stream's last submaps, is compared with the rest of its island or with
 another island. Pair voting proposes alignments; each is grown from two of its pairs under the joint
 covariance. Its evidence is the log-likelihood ratio of its pairs less a penalty for absent
-landmarks: those of one side in view of the other side but not observed by it. Where a submap's
-place is uncertain by a few metres only, three common pairs suffice (`assign_nearby`).
+landmarks: those of one side in view of the other side but not observed by it.
 """
 
 from collections.abc import Callable, Sequence
@@ -72,8 +71,8 @@ NEARLY = 2.0
 class Side(NamedTuple):
     """Landmarks of one side: indices in the joint Gaussian, positions and spreads.
 
-    ids, within: indices in the caller's map and in the whole side. views: landmarks of the whole
-    side observed together. parts: groups of neighbours in the whole side.
+    ids, within: indices in the caller's map and in the whole side. views: landmarks observed
+    together. parts: groups of neighbours.
     """
 
     at: Indices
@@ -419,7 +418,7 @@ def _saved_share(mine: IslandView, theirs: IslandView, found: Closure) -> float:
 
 
 def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
-    """Find the newest of these submaps whose landmarks are assigned to others.
+    """Find the newest of these submaps whose landmarks are assigned to others, a few metres off.
 
     This needs SURE_AFTER pairs, one of them with a standard deviation above `near`, the joint
     evidence of `assign_jointly`, and the share of a closure.

@@ -323,9 +323,9 @@ def select_comparisons(
 ) -> list[Indices]:
     """Select the landmarks that `own` may be, for each submap worth a comparison.
 
-    These are the submap's landmarks and the rivals that it lacks, without which a missed landmark
-    would be associated with its neighbour. sees: landmarks of each submap. most_sd: largest
-    standard deviation of a pair's difference.
+    These are the submap's and the rivals that it lacks, without which a missed landmark would be
+    associated with its neighbour. sees: landmarks of each submap. most_sd: largest standard
+    deviation of a pair's difference.
     """
     others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
     one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)

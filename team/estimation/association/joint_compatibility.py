@@ -3,11 +3,10 @@
 A merged pair conditions the joint Gaussian for the pairs after it, so the sum of the log-likelihood
 ratios (`gating`) is the ratio of all of them together.
 
-`grow_pairs` merges the likeliest pair first, while it has no rival. `assign_jointly` is for
-neighbouring landmarks, which their relative position distinguishes: an assignment has the weight
-exp(Σ LLR) of its pairs, and a pair is accepted if the assignments that contain it outweigh all
-others. Joint compatibility branch and bound (Neira and Tardós 2001, IEEE T-RA 17(6)) instead
-accepts the assignment with the most pairs.
+`grow_pairs` merges the likeliest pair first, while it has no rival. `assign_jointly`, for
+neighbouring landmarks, weighs an assignment by exp(Σ LLR) of its pairs and accepts a pair if the
+assignments with it outweigh all others; joint compatibility branch and bound (Neira and Tardós
+2001, IEEE T-RA 17(6)) accepts the assignment with the most pairs.
 """
 
 from collections.abc import Iterable, Sequence
@@ -215,9 +214,8 @@ def _grow(
 def _find_rivals(
     joint: Joint, first: Indices, second: Indices, at: Likelihoods, profile: AssociationProfile
 ) -> Float[np.ndarray, " k"]:
-    """Find the best LLR of each pair's rivals, which share one of its landmarks.
-
-    A partner that may be a fragment of the same object is no rival.
+    """Find the best LLR of each pair's rivals, which share one of its landmarks and are no
+    fragments.
     """
     rival = np.full(len(first), -np.inf)
     for mine, other in ((first, second), (second, first)):
@@ -360,9 +358,8 @@ def _is_loose(pairs: list[Pair], profile: AssociationProfile) -> bool:
 
 
 def _evaluate_alone(part: Joint, sure: list[Pair], profile: AssociationProfile) -> list[Pair]:
-    """Evaluate the sure pairs given each other alone; none if one fails its gate then.
-
-    A pair's standard deviation may be small only because of a pair that is not accepted.
+    """Evaluate the sure pairs without those that are not accepted; none if one then
+    fails its gate.
     """
     found = merge_in_order(part, [(pair.first, pair.second) for pair in sure], profile)
     if found is None:

@@ -1,8 +1,8 @@
 """Unnamed landmarks as sets of (submap, local landmark), with the evidence for each merge.
 
 A submap adds each of its unnamed landmarks as a set; association merges sets. A set has the number
-of its smallest member, which lasts, or the name of a named landmark. All of this depends only on
-the order in which submaps are added.
+of its smallest member, or the name of a named landmark. All of this depends only on the order in
+which submaps are added.
 """
 
 import hashlib

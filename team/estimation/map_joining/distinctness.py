@@ -1,8 +1,5 @@
 """Landmarks that a final map leaves out, and streams that are lost or tied by odometry alone.
 
-Left out are landmarks placed by an uncertain heading, missed by most submaps that look there, or in
-a repeated part of the map.
-
 A robot that is carried off, or whose odometry slips by metres, maps landmarks twice without a
 contradiction, since only odometry connects its later submaps with the rest. For each boundary
 between submaps beyond which a stream observes hardly any landmark of the rest, the n landmarks
@@ -64,9 +61,9 @@ LEAST_SCALE = 0.1  # least scale of residuals: data without noise have none
 def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
     """Find the unnamed landmarks with which fewer than `least` submaps agree, ascending.
 
-    A submap agrees if its χ² is within `landmark_gate` times min(1, median of the map's χ² / (2 ln
-    2)), the latter its expected median: a stated covariance that is too large must not admit a
-    neighbour. Landmarks of a saved map or judged by an operator are left out.
+    A submap agrees if its χ² is below `landmark_gate` · min(1, median of the map's χ² / (2 ln 2)):
+    covariances stated too large must not admit a neighbour. Landmarks of a saved map or judged by
+    an operator are left out.
     """
     island = fold.main
     graph, settings = island.graph, island.settings
@@ -88,8 +85,8 @@ def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
 
 
 def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
-    """Find the landmarks of the main island that nearly all submaps with a view of them miss,
-    ascending.
+    """Find the landmarks of the main island that nearly all submaps with a view of them miss, by
+    id.
 
     A landmark of n < MOST submaps is missed if each landmark of MOST or more submaps beside it was
     observed by MOST n, and at least half of its submaps have one beside it. Saved maps do not
@@ -163,10 +160,9 @@ class OdometryTie(NamedTuple):
 def find_odometry_ties(
     island: Island, shown: Collection[int], undecided: Collection[int] = ()
 ) -> list[OdometryTie]:
-    """Find each stream's odometry tie with the most evidence of missed landmarks, at least
-    MOST_ABSENT.
+    """Find each stream's odometry tie with the most evidence of missed landmarks (`late_seams`).
 
-    A shown landmark is on both sides. The evidence is that of `late_seams`; without it the
+    It has a shown landmark on both sides, and at least MOST_ABSENT of evidence; with less, the
     covariance of the odometry there is valid.
     """
     unnamed = sorted(node for id_, node in island.graph.landmarks.items() if id_ >= UNNAMED)

@@ -9,8 +9,8 @@ two submaps. Its evidence is the cost that they remove,
 submaps proposes hypotheses, which are solved at the final robust scales. The best by evidence per
 degree of freedom stays in the graph while the others are tested again.
 
-Because real data have errors beyond the model, the evidence is divided by the covariance scale of
-the other submaps, and an effect must exceed the resolution of a single submap.
+For real data, the evidence is divided by the covariance scale of the other submaps, and an effect
+must exceed the resolution of a single submap.
 """
 
 import math
@@ -477,9 +477,9 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
 def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list[Hypothesis]:
     """Drop repetitions, and the apparent effects of another fault.
 
-    One number of two landmarks bends paths, which is no jump. A robot with jumps at several places
-    and no sound submap beside one of them has wild measurements, as has a second place that it
-    alone observes.
+    One number of two landmarks bends paths, which is no jump. Jumps at several places without a
+    sound submap beside one are wild measurements of the robot, as is a second place that it alone
+    observes.
     """
     jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
     wild = {

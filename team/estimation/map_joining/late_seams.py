@@ -1,15 +1,14 @@
 """Seams shown by later submaps: landmarks that one side of a place should have observed.
 
-Among few landmarks a robot that is carried off loses sight of nothing at once (`continuity`). Later
-it misses the landmarks of places that it passes and maps others. The log-likelihood ratio of a
+Among few landmarks a robot that is carried off loses sight of nothing at once (`continuity`), but
+later misses the landmarks of places that it passes and maps others. The log-likelihood ratio of a
 stream elsewhere from a submap on, against one at its place, is
 
   Σ min(Σ_s −ln(1 − p(d_ls)), −ln LEAST_OVERLOOKED) − PRESENT · (landmarks of both sides)
 
 over the landmarks l of one side and the submaps s of the other, unless another landmark of that
-side is within the gate. p(d) is the probability that a submap of the robot observes a landmark at
-distance d, estimated from all its submaps and all landmarks, so that a narrow field of view or
-walls make it small. It is averaged over the uncertainty of d.
+side is within the gate. p(d), the probability that a submap of the robot observes a landmark at
+distance d, is estimated from all its submaps and landmarks and averaged over the uncertainty of d.
 """
 
 import math

@@ -365,8 +365,7 @@ def _largest_agreement(
 ) -> Bool[np.ndarray, " n"]:
     """Mark the most landmarks that the rigid motion of one pair places within the limit.
 
-    The motion from i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps middle to middle. A difference has the
-    covariance of both places, less their correlation with the pair.
+    The motion from i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps middle to middle.
     """
     n = len(a)
     best = np.zeros(n, np.bool_)
