@@ -199,7 +199,7 @@ class Contribution:
 
     @cached_property
     def factor(self) -> core.SubmapFactor:
-        """The submap as a factor. Raises NotACovarianceError that names it."""
+        """Submap as a factor. Raises NotACovarianceError that names it."""
         local = self.local
         P, n = local.covariance, len(local.mean)
         x = np.arange(n - 2 * len(local.ids), n, 2)

@@ -84,5 +84,5 @@ def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[f
 
 
 def moved(increment: Pose, covariance: Float[np.ndarray, "3 3"] | None) -> Moved:
-    """Convert a motion, the end in the frame of the start with |theta| ≤ π."""
+    """Convert a motion, given as the end pose in the start's frame with |theta| ≤ π."""
     return Moved(logarithm(increment), covariance)

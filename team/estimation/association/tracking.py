@@ -234,9 +234,7 @@ class Tracker:
 
 
 def slip_covariance(slip: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the covariance of a slip (forward, left, turn): diag of its squares, at least
-    LEAST_SLIP².
-    """
+    """Return diag(d², d², φ²) of a slip by the distance d and turn φ, both at least LEAST_SLIP."""
     metres = max(core.hypot(*slip[:2]), LEAST_SLIP)
     turn = max(abs(float(slip[2])), LEAST_SLIP)
     return np.diag([core.squared(metres), core.squared(metres), core.squared(turn)])

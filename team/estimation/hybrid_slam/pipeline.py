@@ -301,7 +301,7 @@ class HybridSlam:
         return self._open.particles
 
     def running(self) -> RunningWindow | None:
-        """Gaussian of the open window at its last keyframe."""
+        """Return the Gaussian of the open window at its last keyframe."""
         if self.last_keyframe_ns is None:
             return None
         found = self._open.solve(windows.running)

@@ -1,10 +1,9 @@
 """Time grid of the team, at which every robot has a pose node, and inter-robot measurements.
 
-Robots place nodes at the multiples of node_s, since teammates may observe them there. The
-observer's odometry carries an inter-robot measurement to the nearest grid time within sighting_s in
-the open window; several of one teammate at one node are reduced to one, of fixes the nearest in
-time is used. The antenna of a fix delayed by d is at T⁻¹ a from the robot at the fix's stamp, with
-the motion T over d.
+All robots place nodes at the multiples of node_s, observed or not. The observer's odometry carries
+an inter-robot measurement to the nearest grid time within sighting_s in the open window; several of
+one teammate at one node are reduced to one, of fixes the nearest in time is used. The antenna of a
+fix delayed by d is at T⁻¹ a from the robot at the fix's stamp, with the motion T over d.
 """
 
 from bisect import insort

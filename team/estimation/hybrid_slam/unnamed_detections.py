@@ -1,7 +1,7 @@
 """Association of a window's detections without identities, when the window closes.
 
 Until then the pose follows the odometry and named landmarks. Detections are associated once for all
-particles, which are then computed again.
+particles, which then run over the window again.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,9 @@
 """Fold a tick, cut streams at seams, and undo closures that later submaps contradict.
 
 After a cut (`continuity`) the tick is folded again with the later part as an island. For some ticks
-after a closure or a merge, the share of the landmarks near it that both sides match is computed
-again; below the bound of the settings, these ticks are folded again from the fold before the
-closure, without it. The outcome depends on the set of submaps alone.
+after a closure or a merge, the matched share of the landmarks near it that both sides observed is
+computed again; below the bound of the settings, these ticks are folded again without the closure.
+The outcome depends on the set of submaps alone.
 """
 
 from dataclasses import replace

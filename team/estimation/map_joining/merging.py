@@ -197,7 +197,8 @@ class Waits(NamedTuple):
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
     """Merge the other island into the main one's frame, or return the reason to wait.
 
-    Condensed submaps of the other island wait, too: their frame cannot be transformed.
+    Waits also without a solution, and while the other island has condensed submaps, whose frame is
+    fixed.
     """
     if other.graph.condensed is not None:
         return Waits("its submaps are condensed in a frame of their own", after_search=False)
