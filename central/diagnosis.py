@@ -6,7 +6,6 @@ robot's submaps states of the map. The covariance scale is judged beside all acc
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Final, NamedTuple
@@ -23,10 +22,11 @@ from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, i
 from teamslam.team.estimation.map_joining import hypotheses, marginals
 from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.landmark_view import points_of
 from teamslam.team.estimation.se2 import Pose, wrapped
+from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
+Values = Float[np.ndarray, " _"]
 SIGMAS = 4.0
 """Least size of a shared error in its standard deviations."""
 NONLINEAR = 0.08
@@ -276,63 +276,51 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     With the centred landmarks z of the map and w of a submap as complex numbers, the best rotation
     leaves Σ|z|² + Σ|w|² − 2 |Σ z conj(w)|, the best reflection the same with |Σ z w|.
     """
-    own: dict[str, list[Contribution]] = {}
-    for each in fold.contributions:
-        own.setdefault(each.robot, []).append(each)
-    seen_by: dict[str, set[int]] = {}
-    for joined in fold.main.graph.submaps:
-        of = joined.contribution
-        seen_by.setdefault(of.robot, set()).update(of.local.ids.tolist())
-    observers = Counter(id_ for ids in seen_by.values() for id_ in ids)
-    landmarks = fold.main.graph.landmarks
-    named = [id_ for id_ in sorted(observers) if id_ < UNNAMED and id_ in landmarks]
-    points = points_of(fold.main, named).view(np.complex128)[:, 0].tolist()
-    places = dict(zip(named, points, strict=True))
-    for robot, chain in sorted({**own, **withdrawn}.items()):
-        gains: list[tuple[float, Contribution, list[int]]] = []
-        wrong = 0
-        sole = {id_ for id_ in seen_by.get(robot, ()) if observers[id_] == 1}
-        for each in chain:
-            ids = each.local.ids.tolist()
-            shared = [k for k, id_ in enumerate(ids) if id_ in places and id_ not in sole]
-            if len(shared) >= LEAST_SHARED:
-                z = [places[ids[k]] for k in shared]
-                w = [complex(x, y) for x, y in each.local.landmarks[shared].tolist()]
-                gain = _gain_of_reflection(z, w)
-                gains.append((gain, each, shared))
-                wrong += not gain > 0.0
-            if len(chain) - wrong < MIRRORED * len(chain):  # whatever the others' gains are
-                break
-        if len(gains) >= LEAST_MIRRORED and len(gains) - wrong >= MIRRORED * len(gains):
-            chi2 = (gain / _variance_of(each, shared) for gain, each, shared in gains)
-            yield m.Diagnosis(
-                cause="mirrored",
-                robot=robot,
-                value=(-1.0,),
-                sigma=(0.0,),
-                evidence=math.fsum(chi2) / len(gains),
-                remedy=MIRRORED_REMEDY,
-            )
+    graph, state = fold.main.graph, fold.main.state
+    submaps = [each for each in fold.contributions if each.robot not in withdrawn]
+    submaps += [each for chain in withdrawn.values() for each in chain]
+    robots = sorted({each.robot for each in (*submaps, *fold.contributions)})
+    number = {robot: k for k, robot in enumerate(robots)}
+    of_robot = np.array([number[each.robot] for each in submaps])
+    seen = np.zeros((len(robots), len(graph.fixed)), np.bool_)
+    observers = [number[each.contribution.robot] for each in graph.submaps]
+    seen[np.repeat(observers, np.diff(graph.landmark_start)), graph.landmark_nodes] = True
+    count = seen.sum(axis=0)
 
+    of = np.repeat(np.arange(len(submaps)), [len(each.local.ids) for each in submaps])
+    ids = [id_ for each in submaps for id_ in each.local.ids.tolist()]
+    node = np.array([graph.landmarks.get(id_, -1) if id_ < UNNAMED else -1 for id_ in ids], int)
+    is_shared = (node >= 0) & (count[node] > seen[of_robot[of], node])
+    points = np.concatenate([each.local.landmarks for each in submaps])[is_shared]
+    at, own = graph.offset[node[is_shared]], of[is_shared]
+    shared = np.bincount(own, minlength=len(submaps))
 
-def _gain_of_reflection(z: Sequence[complex], w: Sequence[complex]) -> float:
-    """Squared distance [m²] of a submap's landmarks from the map's by the best rotation, less that
-    by the best reflection; z, w: x + iy [m] in the map and in the submap.
-    """
-    z, w = _centred(z), _centred(w)
-    rotated = sum(a * b.conjugate() for a, b in zip(z, w, strict=True))
-    reflected = sum(a * b for a, b in zip(z, w, strict=True))
-    gain = core.hypot(reflected.real, reflected.imag) - core.hypot(rotated.real, rotated.imag)
-    return float(2.0 * gain)
+    def sums(values: Values) -> Values:
+        return np.bincount(own, values, len(submaps))
 
-
-def _variance_of(submap: Contribution, shared: Sequence[int]) -> float:
-    return float(median(submap.factor.landmarks[shared][:, [0, 2]].ravel().tolist()))
-
-
-def _centred(points: Sequence[complex]) -> list[complex]:
-    middle = sum(points) / len(points)
-    return [point - middle for point in points]
+    x, y, u, v = (
+        values - (sums(values) / np.maximum(shared, 1))[own]
+        for values in (state[at], state[at + 1], points[:, 0], points[:, 1])
+    )
+    xu, yv, xv, yu = sums(x * u), sums(y * v), sums(x * v), sums(y * u)
+    gain = 2.0 * (core.hypot(xu - yv, xv + yu) - core.hypot(xu + yv, yu - xv))
+    for k, robot in enumerate(robots):
+        chain = np.flatnonzero((of_robot == k) & (shared >= LEAST_SHARED))
+        fit = np.count_nonzero(gain[chain] > 0.0)
+        if len(chain) < LEAST_MIRRORED or fit < MIRRORED * len(chain):
+            continue
+        chi2 = [
+            gain[s] / median(submaps[s].factor.landmarks[is_shared[of == s]][:, [0, 2]].ravel())
+            for s in chain.tolist()
+        ]
+        yield m.Diagnosis(
+            cause="mirrored",
+            robot=robot,
+            value=(-1.0,),
+            sigma=(0.0,),
+            evidence=math.fsum(chi2) / len(chain),
+            remedy=MIRRORED_REMEDY,
+        )
 
 
 def _wrong_minimum(fold: Fold) -> Iterator[m.Diagnosis]:
