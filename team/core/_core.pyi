@@ -334,29 +334,36 @@ LARGEST_RATIO: float
 class Quadratic:
     """
     Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,
-    over some nodes of a graph, ascending, none of them fixed.
+    over some nodes of a graph, none of them fixed; and the landmarks at rest given these nodes.
     """
 
     def __init__(self, nodes: NDArray[numpy.int64], at: NDArray[numpy.float64], headings: NDArray[numpy.bool_], information: NDArray[numpy.float64], slope: NDArray[numpy.float64], cost: float) -> None: ...
 
-def add_product(a: NDArray[numpy.float64], b: NDArray[numpy.float64], c: NDArray[numpy.float64], upper: bool = False, lower: bool = False) -> None:
-    """
-    Add A B to the first rows and columns of C, in place; each entry adds its terms in order.
+    @property
+    def nodes(self) -> NDArray[numpy.int64]: ...
 
-    upper: only the upper triangle of the square A B is required, the rest of C may change or not. lower: B is
-    lower triangular, entries above its diagonal count as zero.
-    """
+    @property
+    def at(self) -> NDArray[numpy.float64]:
+        """The linearisation point."""
 
-def upper_and_product(U: NDArray[numpy.float64], among: NDArray[numpy.int64], size: int, A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Add the upper triangle of U among some ascending rows and columns and that of A B, at the corner of a square of
-    `size` rows. Below the diagonal U is not read and the result is undefined.
-    """
+    @property
+    def headings(self) -> NDArray[numpy.bool_]:
+        """Which of its numbers are headings."""
 
-def own_blocks(upper: NDArray[numpy.float64], spread: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """
-    Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.
-    """
+    @property
+    def information(self) -> NDArray[numpy.float64]: ...
+
+    @property
+    def slope(self) -> NDArray[numpy.float64]: ...
+
+    @property
+    def cost(self) -> float: ...
+
+    def woken(self, places: NDArray[numpy.int64], nodes: NDArray[numpy.int64]) -> Quadratic:
+        """
+        Turn some landmarks at rest, by ascending place, into nodes: exact, since the others at rest are conditioned on
+        them. Raises NotPositiveDefiniteError.
+        """
 
 def scatter_of_landmarks(points: NDArray[numpy.float64], spread: NDArray[numpy.float64], of: NDArray[numpy.int64], count: int, most: float) -> NDArray[numpy.float64]:
     """
@@ -478,10 +485,6 @@ class Estimate:
         Entries of A⁻¹ in the layout of the graph's pattern; fixed nodes: identity.
         """
 
-    @property
-    def boundary_covariance(self) -> NDArray[numpy.float64]:
-        """The joint covariance of the condensed factor's nodes."""
-
     def take_step(self, damping: float, halvings: int, most_damping: float) -> tuple[NDArray[numpy.float64] | None, float, float]:
         """
         Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on; else a
@@ -510,10 +513,28 @@ class Estimate:
         the start pose and their own.
         """
 
-    def quadratic(self, nodes: NDArray[numpy.int64], submaps: NDArray[numpy.bool_], sightings: NDArray[numpy.bool_], priors: NDArray[numpy.bool_]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64], float]:
+    def points(self, members: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
         """
-        Sum the marked factors and the condensed one to matrix A, half the gradient and the cost, over some nodes,
-        ascending; other nodes are constants.
+        Find the points of landmarks, by their nodes, or -1 - k for the k-th at rest.
+        """
+
+    def blocks(self, members: NDArray[numpy.int64]) -> NDArray[numpy.float64]:
+        """
+        Compute the covariance of each landmark; zero of a fixed node. members: as of `points`.
+        """
+
+    def joint(self, members: NDArray[numpy.int64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
+        """
+        Compute mean and joint covariance of nodes and of landmarks at rest; zero of fixed nodes. members: as of `points`.
+        """
+
+    def condense(self, leaving: NDArray[numpy.bool_], resting: NDArray[numpy.int64], given_up: NDArray[numpy.int64], runs: Sequence[NDArray[numpy.int64]]) -> tuple[Quadratic, NDArray[numpy.bool_], int, NDArray[numpy.bool_], NDArray[numpy.bool_]]:
+        """
+        Condense some submaps: eliminate their poses but for the ends of the paths, and landmarks that come to rest or
+        are given up. runs: the submaps in the order in which they are eliminated, if none has been before.
+
+        Returns the factor over the renumbered nodes that stay, marks of the eliminated nodes and the number of their
+        free unknowns, and marks of the inter-robot measurements and priors in it. Raises NotPositiveDefiniteError.
         """
 
 class WholeMap:

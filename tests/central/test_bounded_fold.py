@@ -44,9 +44,9 @@ def bits(fold):
     parts = [fold.main.state.tobytes(), *(str(c.key).encode() for c in fold.contributions)]
     if old is None:
         return b"".join(parts)
-    rest = old.resting
-    more = () if rest is None else (rest.ids, rest.means, rest.gain, np.triu(rest.upper))
-    return b"".join([*parts, *(each.tobytes() for each in (old.information, *more))])
+    rest = landmark_view.resting(fold.main)
+    more = (of(fold.main, rest) for of in (landmark_view.points_of, landmark_view.blocks_of))
+    return b"".join([*parts, *(each.tobytes() for each in (old.factor.information, *more))])
 
 
 def straight(bounded=True):
@@ -61,7 +61,7 @@ def straight(bounded=True):
 def expected():
     fold = straight().fold
     assert fold.condensed_count > 0.5 * len(SUBMAPS.every())
-    assert len(landmark_view.resting_of(fold.main).ids) > 1
+    assert len(landmark_view.resting(fold.main)) > 1
     return bits(fold)
 
 

@@ -91,7 +91,7 @@ def bits(fold):
     seen = [str(each.observation[:2]) for each in fold.main.graph.observed]
     parts = [fold.main.state.tobytes(), *map(str.encode, seen), str(fold.landmarks.sets).encode()]
     parts.append(str(fold.landmarks.present).encode())
-    return b"".join(parts if old is None else [*parts, old.information.tobytes()])
+    return b"".join(parts if old is None else [*parts, old.factor.information.tobytes()])
 
 
 def test_the_running_fold_is_bounded_and_the_full_solution_is_that_of_the_raw_set(world, ticks):

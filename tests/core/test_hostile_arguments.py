@@ -62,7 +62,7 @@ EXAMPLES = {
     **dict.fromkeys(("A", "B", "P", "a", "b", "c", "upper"), lambda: covariance(4)),
     **dict.fromkeys(("L", "S"), lambda: np.linalg.cholesky(covariance(2))),
     **dict.fromkeys(("forward.B", "solve_factored.B", "error"), POINT.copy),
-    **dict.fromkeys(("add_product.upper", "lower", "improved", "robust"), lambda: False),
+    **dict.fromkeys(("improved", "robust"), lambda: False),
     **dict.fromkeys(("turns_first", "is_measured", "joined_ranges", "with_nodes"), lambda: False),
     "spread": lambda: np.ones((4, 3)),
     **dict.fromkeys(("x", "y", "angle", "dof"), MEAN.copy),
@@ -123,10 +123,13 @@ EXAMPLES = {
     "submaps": lambda: [(made("SubmapFactor"), np.arange(5))],
     "sightings": lambda: [(0, 1, np.array([1.0, 0.1]), covariance(2), POINT)],
     "priors": lambda: [(np.array([4]), np.zeros(1), np.ones((1, 1)), True)],
-    **{
-        f"Estimate.quadratic.{each}": lambda: np.array([True])
-        for each in ("submaps", "sightings", "priors")
-    },
+    **dict.fromkeys(
+        ("Quadratic.woken.places", "Quadratic.woken.nodes"), lambda: np.zeros(0, np.int64)
+    ),
+    "members": lambda: np.array([2, 3]),
+    "leaving": lambda: np.array([True]),
+    **dict.fromkeys(("resting", "given_up"), lambda: np.zeros(0, np.int64)),
+    "runs": lambda: [np.array([0])],
     "condensed": lambda: made("Quadratic"),
     "graph": lambda: one_graph(),
     "scale": lambda: np.ones(1),
@@ -134,10 +137,6 @@ EXAMPLES = {
     "damping": lambda: 0.0,
     "halvings": lambda: 4,
     "most_damping": lambda: 1e6,
-    "U": lambda: covariance(4),
-    "among": lambda: np.array([0, 1, 3]),
-    "size": lambda: 5,
-    **{f"upper_and_product.{each}": lambda: covariance(3) for each in "AB"},
     "packed": lambda: np.ones(3),
     "squares": lambda: np.array([4.0, 1.0]),
     **dict.fromkeys(("medians", "chi2_scale.dof"), lambda: np.array([4.35, 1.4])),

@@ -13,7 +13,6 @@ using graph::Estimate, graph::Graph, graph::Index, graph::Indices, graph::Quadra
 
 namespace {
 
-using Changed = nb::ndarray<double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using SubmapFactor = std::tuple<std::shared_ptr<Submap>, std::vector<Index>>;
 using Sighting = std::tuple<Index, Index, Values, Table, Values>;
 using Prior = std::tuple<std::vector<Index>, graph::Numbers, Matrix, bool>;
@@ -55,6 +54,17 @@ scan::Observed observed_of(const Table& points, const Table& spread, double most
   check(points.shape(1) == 2 && spread.shape(1) == 3 && points.shape(0) == spread.shape(0),
         "an observation has a point (x, y) and a covariance (xx, xy, yy)");
   return {matrix_of(points), matrix_of(spread), most};
+}
+
+// Nodes, or -1 - k for the k-th landmark at rest, in a map.
+Indices members_of(const Estimate& estimate, Indices members, bool are_landmarks) {
+  const Graph& graph = estimate.graph();
+  const Index at_rest = graph.condensed ? Index(graph.condensed->resting.means.size() / 2) : 0;
+  for (const Index member : members) {
+    check(-1 - member < at_rest && member < Index(graph.nodes()), "there is no such member of the map");
+    check(!are_landmarks || member < 0 || graph.size_of(member) == 2, "a landmark has two numbers");
+  }
+  return members;
 }
 
 // The indices of a submap's members in a state.
@@ -149,55 +159,39 @@ void bind_graph(nb::module_& m) {
 
   nb::class_<Quadratic>(m, "Quadratic",
                         "Old factors, linearised: cost + 2 slopeᵀ d + dᵀ information d, d = x - at with headings wrapped,\n"
-                        "over some nodes of a graph, ascending, none of them fixed.")
+                        "over some nodes of a graph, none of them fixed; and the landmarks at rest given these nodes.")
       .def("__init__",
            [](Quadratic* self, const std::vector<Index>& nodes, const graph::Numbers& at, const Marks& headings,
               const Matrix& information, const graph::Numbers& slope, double cost) {
              const std::size_t n = at.size();
              check(headings.size() == n && slope.size() == n && is_square(information, n),
                    "the parts of a quadratic must have one size");
-             new (self) Quadratic{nodes, at, headings, information, slope, cost};
+             new (self) Quadratic{{information, slope, cost}, nodes, at, headings, {}};
+             self->resting.gain = Matrix(0, n);
            },
-           "nodes"_a, "at"_a, "headings"_a, "information"_a, "slope"_a, "cost"_a);
-
-  m.def("add_product",
-        [](const Table& a, const Table& b, const Changed& c, bool upper, bool lower) {
-          check(a.shape(1) == b.shape(0), "a must have as many columns as b has rows");
-          check(c.shape(0) >= a.shape(0) && c.shape(1) >= b.shape(1), "the sum must have room for the product");
-          dense::add_product(matrix_of(a), matrix_of(b), {c.data(), a.shape(0), b.shape(1), c.shape(1)}, {upper, lower});
-        },
-        "a"_a, "b"_a, nb::arg("c").noconvert(), "upper"_a = false, "lower"_a = false,
-        "Add A B to the first rows and columns of C, in place; each entry adds its terms in order.\n\n"
-        "upper: only the upper triangle of the square A B is required, the rest of C may change or not. lower: B is\n"
-        "lower triangular, entries above its diagonal count as zero.");
-  m.def("upper_and_product",
-        [](const Table& U, Indices among, std::size_t size, const Table& A, const Table& B) {
-          const std::size_t m = among.size(), n = U.shape(0);
-          check(U.shape(1) == n, "the matrix must be square");
-          for (std::size_t k = 0; k < m; k++)
-            check(among[k] >= (k ? among[k - 1] + 1 : 0) && std::size_t(among[k]) < n, "rows must be of the matrix, ascending");
-          check(size >= m && A.shape(0) == m && B.shape(1) == m && A.shape(1) == B.shape(0),
-                "the product must have the chosen rows and columns, and room in the result");
-          return dense::upper_and_product(matrix_of(U), among, size, matrix_of(A), matrix_of(B));
-        },
-        "U"_a, "among"_a, "size"_a, "A"_a, "B"_a,
-        "Add the upper triangle of U among some ascending rows and columns and that of A B, at the corner of a square of\n"
-        "`size` rows. Below the diagonal U is not read and the result is undefined.");
-  m.def("own_blocks",
-        [](const Table& upper, const Table& spread) {
-          const std::size_t count = spread.shape(0) / 2, n = spread.shape(1);
-          check(spread.shape(0) % 2 == 0 && upper.shape(0) == 2 * count && upper.shape(1) == 2 * count,
-                "both matrices must have two rows for each landmark");
-          std::vector<double> blocks;
-          for (std::size_t k = 0; k < 2 * count; k += 2) {
-            const std::span<const double> x{spread.data() + k * n, n}, y{spread.data() + (k + 1) * n, n};
-            const double cross = upper(k, k + 1) + dense::inner(x, y);
-            blocks.insert(blocks.end(), {upper(k, k) + dense::inner(x, x), cross, cross,
-                                         upper(k + 1, k + 1) + dense::inner(y, y)});
-          }
-          return made<double, nb::ndim<3>>(std::move(blocks), {count, 2, 2});
-        },
-        "upper"_a, "spread"_a, "Compute the 2 × 2 diagonal blocks of C + S Sᵀ, from the upper triangle of C.");
+           "nodes"_a, "at"_a, "headings"_a, "information"_a, "slope"_a, "cost"_a)
+      .def_ro("nodes", &Quadratic::nodes)
+      .def_ro("at", &Quadratic::at, "The linearisation point.")
+      .def_ro("headings", &Quadratic::is_heading, "Which of its numbers are headings.")
+      .def_ro("information", &Quadratic::information)
+      .def_ro("slope", &Quadratic::slope)
+      .def_ro("cost", &Quadratic::cost)
+      .def("woken",
+           [](const Quadratic& self, const std::vector<Index>& places, const std::vector<Index>& nodes) {
+             check(places.size() == nodes.size(), "each landmark has a node");
+             std::vector<std::size_t> ascending;
+             for (std::size_t k = 0; k < places.size(); k++) {
+               check(places[k] >= (k ? places[k - 1] + 1 : 0) && 2 * std::size_t(places[k]) < self.resting.means.size(),
+                     "places must be of landmarks at rest, ascending");
+               ascending.push_back(std::size_t(places[k]));
+             }
+             std::optional<Quadratic> made = self.woken(ascending, nodes);
+             if (!made) throw sparse::NotPositiveDefinite(nodes[0]);
+             return std::move(*made);
+           },
+           "places"_a, "nodes"_a,
+           "Turn some landmarks at rest, by ascending place, into nodes: exact, since the others at rest are conditioned on\n"
+           "them. Raises NotPositiveDefiniteError.");
 
   m.def("scatter_of_landmarks",
         [](const Table& points, const Table& spread, Indices of, std::size_t count, double most) {
@@ -275,9 +269,6 @@ void bind_graph(nb::module_& m) {
                    "The full step's squared length in standard deviations, gᵀA⁻¹g.")
       .def_prop_ro("selected_covariance", &Estimate::selected_covariance,
                    "Entries of A⁻¹ in the layout of the graph's pattern; fixed nodes: identity.")
-      .def_prop_ro("boundary_covariance",
-                   [](const Estimate& self) { return self.graph().among_boundary(self.selected_covariance()); },
-                   "The joint covariance of the condensed factor's nodes.")
       .def("take_step",
            [](const Estimate& self, double damping, int halvings, double most_damping) {
              check(damping >= 0.0, "the damping must not be negative");
@@ -301,21 +292,50 @@ void bind_graph(nb::module_& m) {
                    },
                    "Points of the landmarks of each submap by its start pose, and their covariances (xx, xy, yy) from that of\n"
                    "the start pose and their own.")
-      .def("quadratic",
-           [](const Estimate& self, Indices nodes, const Marks& submaps, const Marks& sightings, const Marks& priors) {
-             const Graph& graph = self.graph();
-             for (std::size_t k = 0; k < nodes.size(); k++)
-               check(nodes[k] >= (k ? nodes[k - 1] + 1 : 0) && nodes[k] < Index(graph.nodes()),
-                     "nodes must be nodes of the graph, ascending");
-             check(submaps.size() == graph.submaps.size() && sightings.size() == graph.sightings.size() &&
-                       priors.size() == graph.priors.size(),
-                   "each factor has a mark");
-             graph::Summed sum = self.quadratic(nodes, {submaps, sightings, priors});
-             return std::tuple(std::move(sum.information), std::move(sum.slope), sum.cost);
+      .def("points",
+           [](const Estimate& self, Indices members) {
+             graph::Numbers found = self.points(members_of(self, members, true));
+             return made<double, nb::ndim<2>>(std::move(found), {members.size(), 2});
            },
-           "nodes"_a, "submaps"_a, "sightings"_a, "priors"_a,
-           "Sum the marked factors and the condensed one to matrix A, half the gradient and the cost, over some nodes,\n"
-           "ascending; other nodes are constants.");
+           "members"_a, "Find the points of landmarks, by their nodes, or -1 - k for the k-th at rest.")
+      .def("blocks",
+           [](const Estimate& self, Indices members) {
+             graph::Numbers found = self.blocks(members_of(self, members, true));
+             return made<double, nb::ndim<3>>(std::move(found), {members.size(), 2, 2});
+           },
+           "members"_a, "Compute the covariance of each landmark; zero of a fixed node. members: as of `points`.")
+      .def("joint", [](const Estimate& self, Indices members) { return self.joint(members_of(self, members, false)); },
+           "members"_a,
+           "Compute mean and joint covariance of nodes and of landmarks at rest; zero of fixed nodes. members: as of `points`.")
+      .def("condense",
+           [](const Estimate& self, const Marks& leaving, Indices resting, Indices given_up,
+              const std::vector<std::vector<Index>>& runs) {
+             const Graph& graph = self.graph();
+             const std::size_t count = graph.submaps.size();
+             check(leaving.size() == count, "each submap has a mark");
+             Marks listed(count);
+             for (const std::vector<Index>& run : runs) {
+               check(!run.empty(), "a run has a submap");
+               for (const Index f : run) {
+                 check(f >= 0 && std::size_t(f) < count && leaving[f] && !listed[f], "the runs have each leaving submap once");
+                 listed[f] = true;
+               }
+             }
+             check(listed == leaving, "the runs have each leaving submap once");
+             for (const Indices nodes : {resting, given_up})
+               for (std::size_t k = 0; k < nodes.size(); k++)
+                 check(nodes[k] >= (k ? nodes[k - 1] + 1 : 0) && std::size_t(nodes[k]) < graph.nodes() &&
+                           graph.size_of(nodes[k]) == 2 && !graph.fixed[nodes[k]],
+                       "landmarks must be free nodes of two numbers, ascending");
+             graph::Condensing made = self.condense(leaving, resting, given_up, runs);
+             return std::tuple(std::move(made.factor), std::move(made.eliminated), made.unknowns,
+                               std::move(made.factors.sightings), std::move(made.factors.priors));
+           },
+           "leaving"_a, "resting"_a, "given_up"_a, "runs"_a,
+           "Condense some submaps: eliminate their poses but for the ends of the paths, and landmarks that come to rest or\n"
+           "are given up. runs: the submaps in the order in which they are eliminated, if none has been before.\n\n"
+           "Returns the factor over the renumbered nodes that stay, marks of the eliminated nodes and the number of their\n"
+           "free unknowns, and marks of the inter-robot measurements and priors in it. Raises NotPositiveDefiniteError.");
 }
 
 }  // namespace teamslam::binding

@@ -73,27 +73,6 @@ Matrix product(Const a, Const b) {
   return c;
 }
 
-void add_product(Const a, Const b, View c, Shape shape) {
-  assert(a.columns == b.rows && c.rows == a.rows);
-  multiply<Into::ADD>(c, by_rows(a), b, shape);
-}
-
-Matrix upper_and_product(Const U, std::span<const std::int64_t> among, std::size_t size, Const A, Const B) {
-  const std::size_t m = among.size();
-  assert(size >= m && A.rows == m && B.columns == m);
-  std::vector<std::size_t> end(m);  // behind the run of neighbours that holds each place
-  for (std::size_t j = m; j-- > 0;) end[j] = j + 1 < m && among[j + 1] == among[j] + 1 ? end[j + 1] : j + 1;
-  Matrix made(size, size);
-  for (std::size_t begin = 0; begin < m; begin += BLOCK) {  // a block's rows stay in the cache
-    const std::size_t high = std::min(BLOCK, m - begin), wide = m - begin;
-    for (std::size_t i = begin; i < begin + high; i++)
-      for (std::size_t j = i; j < m; j = end[j]) std::copy_n(U[among[i]] + among[j], end[j] - j, made[i] + j);
-    add_product(A.part(begin, 0, high, A.columns), B.part(0, begin, B.rows, wide),
-                made.view().part(begin, begin, high, wide), {.is_upper = true});
-  }
-  return made;
-}
-
 bool solve(View A, View B) {
   assert(A.rows == A.columns && B.rows == A.rows);
   const std::size_t n = A.rows, many = B.columns;

@@ -101,13 +101,6 @@ struct Shape {
   bool is_left_upper = false;  // A is upper triangular, with zeros below
 };
 
-// C += A B, each entry its terms in order; C overlaps neither A nor B. `product.hpp` has more of these.
-void add_product(Const a, Const b, View c, Shape shape = {});
-
-// The upper triangle of U among some ascending rows and columns plus that of A B, at the corner of a square of
-// `size` rows. Below the diagonal of U nothing is read, and below that of the result nothing is meant.
-Matrix upper_and_product(Const U, std::span<const std::int64_t> among, std::size_t size, Const A, Const B);
-
 // B := A⁻¹ B by elimination with partial pivoting, A := what is left of it; false for a zero pivot.
 [[nodiscard]] bool solve(View A, View B);
 

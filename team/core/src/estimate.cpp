@@ -1,5 +1,9 @@
 #include "estimate.hpp"
 
+#include <algorithm>
+
+#include "product.hpp"
+
 namespace teamslam::graph {
 
 namespace {
@@ -388,14 +392,22 @@ Observations Estimate::observations() const {
   return found;
 }
 
-Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
-  const Graph& graph = *graph_;
-  std::vector<std::ptrdiff_t> place(graph.nodes(), -1);
+// The place of the first number of each node among those of some nodes; beyond them for others.
+std::vector<std::size_t> Estimate::places_of(Indices nodes) const {
+  std::vector<std::size_t> place(graph_->nodes(), graph_->unknowns());
   std::size_t total = 0;
   for (const Index node : nodes) {
-    place[node] = std::ptrdiff_t(total);
-    total += graph.size_of(node);
+    place[node] = total;
+    total += graph_->size_of(node);
   }
+  return place;
+}
+
+Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
+  const Graph& graph = *graph_;
+  const std::vector<std::size_t> place = places_of(nodes);
+  std::size_t total = 0;
+  for (const Index node : nodes) total += graph.size_of(node);
   Summed sum{dense::Matrix(total, total), Numbers(total), condensed_terms().cost + cost_of_factors(marked)};
   dense::Matrix& H = sum.information;
   Numbers& g = sum.slope;
@@ -404,7 +416,7 @@ Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
     std::size_t row = 0;
     for (const Index node : of)
       for (std::size_t p = 0, size = graph.size_of(node); p < size; p++, row++)
-        if (place[node] >= 0) do_number(std::size_t(place[node]) + p, row);
+        if (place[node] < total) do_number(place[node] + p, row);
   };
   const auto add_matrix = [&](Indices of, double weight, dense::Const hessian) {
     each_number(of, [&](std::size_t i, std::size_t row) {
@@ -448,6 +460,254 @@ Summed Estimate::quadratic(Indices nodes, const Marked& marked) const {
     add_matrix(each.nodes, prior_weights[k], each.information);
   }
   return sum;
+}
+
+Summed Estimate::eliminate_paths(const std::vector<std::vector<Index>>& runs, Marked rest,
+                                 const std::vector<bool>& eliminated, std::vector<Index>& nodes) const {
+  const Graph& graph = *graph_;
+  struct Left {
+    std::vector<Index> nodes;
+    Summed sum;
+  };
+  std::vector<Left> left;
+  const auto add = [&](const Left& each, Summed& sum, Indices over) {
+    const std::vector<std::size_t> place = places_of(over);
+    std::vector<std::size_t> at;
+    for (const Index node : each.nodes)
+      for (std::size_t p = 0; p < graph.size_of(node); p++) at.push_back(place[node] + p);
+    for (std::size_t i = 0; i < at.size(); i++) {
+      sum.slope[at[i]] += each.sum.slope[i];
+      for (std::size_t j = 0; j < at.size(); j++) sum.information[at[i]][at[j]] += each.sum.information[i][j];
+    }
+  };
+  double total = 0.0;
+  for (const std::vector<Index>& run : runs) {
+    std::vector<bool> path(graph.nodes()), chosen(graph.submaps.size()), touched(graph.nodes());
+    for (const Index f : run) {
+      graph.mark_path(std::size_t(f), path);
+      chosen[f] = true;
+    }
+    for (std::size_t node = 0; node < graph.nodes(); node++) path[node] = path[node] && !graph.fixed[node];
+    Marked taken = graph.touching(chosen, path);
+    for (const auto& [marks, of_rest] :
+         {std::pair{&taken.sightings, &rest.sightings}, std::pair{&taken.priors, &rest.priors}})
+      for (std::size_t k = 0; k < marks->size(); k++) {
+        (*marks)[k] = (*marks)[k] && (*of_rest)[k];
+        (*of_rest)[k] = (*of_rest)[k] && !(*marks)[k];
+      }
+    for (const Index f : run) rest.submaps[f] = false;
+    graph.mark_nodes(taken, touched);
+    const auto beside = std::stable_partition(left.begin(), left.end(), [&](const Left& each) {
+      return std::none_of(each.nodes.begin(), each.nodes.end(), [&](Index node) { return path[node]; });
+    });
+    for (auto each = beside; each != left.end(); each++)
+      for (const Index node : each->nodes) touched[node] = true;
+    std::vector<Index> of_run, stays;
+    std::vector<bool> is_out;
+    for (std::size_t node = 0; node < graph.nodes(); node++) {
+      if (!touched[node] || graph.fixed[node]) continue;
+      of_run.push_back(Index(node));
+      is_out.insert(is_out.end(), graph.size_of(Index(node)), path[node]);
+      if (!path[node]) stays.push_back(Index(node));
+    }
+    Summed sum = quadratic(of_run, taken);
+    for (auto each = beside; each != left.end(); each++) add(*each, sum, of_run);
+    left.erase(beside, left.end());
+    std::optional<Elimination> parts = eliminate(std::move(sum), is_out);
+    if (!parts) throw sparse::NotPositiveDefinite(graph.submaps[run[0]].nodes[0]);
+    total += parts->rest.cost;
+    left.push_back({std::move(stays), std::move(parts->rest)});
+  }
+  std::erase_if(nodes, [&](Index node) { return eliminated[node] && graph.size_of(node) != 2; });
+  Summed sum = quadratic(nodes, rest);
+  for (const Left& each : left) add(each, sum, nodes);
+  sum.cost = total + sum.cost;
+  return sum;
+}
+
+Condensing Estimate::condense(const std::vector<bool>& leaving, Indices resting, Indices given_up,
+                              const std::vector<std::vector<Index>>& runs) const {
+  const Graph& graph = *graph_;
+  const Quadratic* before = graph.condensed.get();
+  Condensing made{{}, std::vector<bool>(graph.nodes()), 0, {}};
+  for (std::size_t f = 0; f < leaving.size(); f++)
+    if (leaving[f]) graph.mark_path(f, made.eliminated);
+  for (const Indices landmarks : {resting, given_up})
+    for (const Index node : landmarks) made.eliminated[node] = true;
+  made.factors = graph.touching(leaving, made.eliminated);
+  std::vector<bool> touched(graph.nodes());
+  graph.mark_nodes(made.factors, touched);
+  if (before)
+    for (const Index node : before->nodes) touched[node] = true;
+  for (const Index node : resting)
+    if (!touched[node]) throw std::invalid_argument("a landmark that comes to rest is in no factor that is condensed");
+  std::vector<Index> nodes;
+  for (std::size_t node = 0; node < graph.nodes(); node++) {
+    if (!touched[node] || graph.fixed[node]) continue;
+    nodes.push_back(Index(node));
+    if (made.eliminated[node]) made.unknowns += graph.size_of(Index(node));
+  }
+  Summed sum = before ? quadratic(nodes, made.factors) : eliminate_paths(runs, made.factors, made.eliminated, nodes);
+
+  Quadratic& factor = made.factor;
+  std::vector<bool> is_out;
+  std::vector<Index> renumbered(graph.nodes());
+  for (std::size_t node = 0, stays = 0; node < graph.nodes(); node++) {
+    renumbered[node] = Index(stays);
+    stays += !made.eliminated[node];
+  }
+  for (const Index node : nodes) {
+    const std::size_t size = graph.size_of(node);
+    is_out.insert(is_out.end(), size, made.eliminated[node]);
+    if (made.eliminated[node]) continue;
+    factor.nodes.push_back(renumbered[node]);
+    for (std::size_t p = 0; p < size; p++) {
+      factor.at.push_back(state_[graph.offset[node] + p]);
+      factor.is_heading.push_back(size == 3 && p == 2);
+    }
+  }
+  std::optional<Elimination> parts = eliminate(std::move(sum), is_out);
+  if (!parts) throw sparse::NotPositiveDefinite(nodes[0]);
+  if (!resting.empty() || (before && !before->resting.means.empty())) {
+    const std::vector<std::size_t> place = places_of(nodes);
+    std::vector<std::size_t> among(is_out.size()), of_before, rests;  // among: the place of eliminated ones
+    for (std::size_t k = 0; k < parts->eliminated.size(); k++) among[parts->eliminated[k]] = k;
+    if (before)
+      for (const Index node : before->nodes)
+        for (std::size_t p = 0; p < graph.size_of(node); p++) of_before.push_back(place[node] + p);
+    Numbers points;
+    for (const Index node : resting)
+      for (std::size_t p = 0; p < 2; p++) {
+        rests.push_back(among[place[node] + p]);
+        points.push_back(state_[graph.offset[node] + p]);
+      }
+    factor.rest(before, *parts, of_before, before ? before->difference(state_, graph.boundary()) : Numbers(), rests, points);
+  }
+  static_cast<Summed&>(factor) = std::move(parts->rest);
+  return made;
+}
+
+const Numbers& Estimate::resting_points() const {
+  return once(resting_points_, [&] {
+    const Quadratic& old = *graph_->condensed;
+    Numbers points = dense::product(old.resting.gain, old.difference(state_, graph_->boundary()));
+    for (std::size_t i = 0; i < points.size(); i++) points[i] = old.resting.means[i] + points[i];
+    return points;
+  });
+}
+
+const dense::Matrix& Estimate::boundary_covariance() const {
+  return once(boundary_covariance_, [&] { return graph_->among_boundary(selected_covariance()); });
+}
+
+const dense::Matrix& Estimate::resting_spread() const {
+  return once(resting_spread_, [&] {
+    const dense::Matrix& gain = graph_->condensed->resting.gain;
+    const std::optional<dense::Matrix> root = dense::cholesky(boundary_covariance());
+    if (!root) throw sparse::NotPositiveDefinite(graph_->condensed->nodes[0]);
+    dense::Matrix spread(gain.rows(), gain.columns());
+    dense::multiply<dense::Into::SET>(spread.view(), dense::by_rows(gain), *root, {.is_lower = true});
+    return spread;
+  });
+}
+
+Numbers Estimate::points(Indices members) const {
+  Numbers found;
+  for (const Index member : members) {
+    const double* point = member < 0 ? &resting_points()[2 * (-1 - member)] : &state_[graph_->offset[member]];
+    found.insert(found.end(), point, point + 2);
+  }
+  return found;
+}
+
+Numbers Estimate::blocks(Indices members) const {
+  Numbers found;
+  for (const Index member : members) {
+    if (member >= 0) {
+      const double* block = &selected_covariance()[graph_->diagonal_of(member)];
+      for (std::size_t i = 0; i < 4; i++) found.push_back(graph_->fixed[member] ? 0.0 : block[i]);
+      continue;
+    }
+    const std::size_t x = 2 * std::size_t(-1 - member), y = x + 1, n = resting_spread().columns();
+    const Resting& resting = graph_->condensed->resting;
+    const std::span<const double> of_x{resting_spread()[x], n}, of_y{resting_spread()[y], n};
+    const double cross = resting.variance(x, y) + dense::inner(of_x, of_y);
+    found.insert(found.end(), {resting.variance(x, x) + dense::inner(of_x, of_x), cross, cross,
+                               resting.variance(y, y) + dense::inner(of_y, of_y)});
+  }
+  return found;
+}
+
+std::pair<Numbers, dense::Matrix> Estimate::joint(Indices members) const {
+  const Graph& graph = *graph_;
+  Numbers mean;
+  // Of the numbers of nodes: their unknowns, their places in the result, whether they are constants; of those at rest
+  // their numbers there and their places.
+  std::vector<Index> unknowns, outside;
+  std::vector<std::size_t> at, rests, at_rest;
+  std::vector<bool> is_fixed;
+  for (const Index member : members)
+    if (member < 0) {
+      for (std::size_t i = 2 * std::size_t(-1 - member), last = i + 1; i <= last; i++) {
+        rests.push_back(i);
+        at_rest.push_back(mean.size());
+        mean.push_back(resting_points()[i]);
+      }
+    } else {
+      for (Index i = graph.offset[member]; i < graph.offset[member + 1]; i++) {
+        unknowns.push_back(i);
+        is_fixed.push_back(graph.fixed[member]);
+        at.push_back(mean.size());
+        mean.push_back(state_[i]);
+      }
+    }
+  const std::size_t n = unknowns.size(), m = rests.size();
+  if (m == 0) {
+    dense::Matrix covariance = posterior()->inverse_block(unknowns);
+    for (std::size_t i = 0; i < n; i++)
+      for (std::size_t j = 0; j < n; j++)
+        if (is_fixed[i] || is_fixed[j]) covariance[i][j] = 0.0;
+    return {std::move(mean), std::move(covariance)};
+  }
+  // The selected inverse has the covariances among the condensed factor's nodes; other nodes take a solution each.
+  const dense::Matrix& P = boundary_covariance();
+  const std::size_t size = graph.boundary().size();
+  std::vector<std::size_t> in_boundary(state_.size(), size), column(n);
+  for (std::size_t k = 0; k < size; k++) in_boundary[graph.boundary()[k]] = k;
+  for (std::size_t i = 0; i < n; i++)
+    if (in_boundary[unknowns[i]] == size) {
+      column[i] = outside.size();
+      outside.push_back(unknowns[i]);
+    }
+  const dense::Matrix solved = posterior()->inverse_columns(outside);
+  const auto covariance = [&](std::size_t i, std::size_t j) {
+    const std::size_t of_i = in_boundary[unknowns[i]], of_j = in_boundary[unknowns[j]];
+    if (of_i == size) return is_fixed[i] ? 0.0 : solved[unknowns[j]][column[i]];
+    if (of_j == size) return is_fixed[j] ? 0.0 : solved[unknowns[i]][column[j]];
+    return P[of_i][of_j];
+  };
+  dense::Matrix with_boundary(n, size), gain(m, size), spread(m, size), found(mean.size(), mean.size());
+  for (std::size_t i = 0; i < n; i++) {
+    for (std::size_t j = 0; j < n; j++) found[at[i]][at[j]] = 0.5 * (covariance(i, j) + covariance(j, i));
+    const std::size_t own = in_boundary[unknowns[i]];
+    for (std::size_t k = 0; k < size; k++) {
+      if (own < size) with_boundary[i][k] = P[own][k];
+      else if (!is_fixed[i]) with_boundary[i][k] = solved[graph.boundary()[k]][column[i]];
+    }
+  }
+  for (std::size_t k = 0; k < m; k++) {
+    std::copy_n(graph.condensed->resting.gain[rests[k]], size, gain[k]);
+    std::copy_n(resting_spread()[rests[k]], size, spread[k]);
+  }
+  const dense::Matrix cross = dense::product(gain, dense::transposed(with_boundary));
+  const dense::Matrix among = dense::product(spread, dense::transposed(spread));
+  for (std::size_t k = 0; k < m; k++) {
+    for (std::size_t i = 0; i < n; i++) found[at_rest[k]][at[i]] = found[at[i]][at_rest[k]] = cross[k][i];
+    for (std::size_t l = 0; l < m; l++)
+      found[at_rest[k]][at_rest[l]] =
+          0.5 * (among[k][l] + among[l][k]) + graph.condensed->resting.variance(rests[k], rests[l]);
+  }
+  return {std::move(mean), std::move(found)};
 }
 
 }  // namespace teamslam::graph

@@ -21,16 +21,13 @@ struct Loss {
   bool has_joined_ranges;          // whether errors of ranges are proportional to those of the joined map
 };
 
-// Marks of factors, in the graph's order.
-struct Marked {
-  std::vector<bool> submaps, sightings, priors;
-};
-
-// cost + 2 slopeᵀ d + dᵀ information d over some nodes.
-struct Summed {
-  dense::Matrix information;
-  Numbers slope;
-  double cost;
+// The condensed factor after some submaps have left, and what it takes from the graph: eliminated nodes, of so many
+// free numbers, and factors.
+struct Condensing {
+  Quadratic factor;  // over the renumbered nodes that stay
+  std::vector<bool> eliminated;
+  std::size_t unknowns;
+  Marked factors;
 };
 
 // A row for each landmark of each submap: its point in the frame by the submap's start pose, and its
@@ -87,9 +84,22 @@ class Estimate {
   // Throws sparse::NotPositiveDefinite.
   Observations observations() const;
 
-  // The marked factors and the condensed one as one quadratic at this state, over these nodes,
-  // ascending; the factors' other nodes are constants.
-  Summed quadratic(Indices nodes, const Marked& marked) const;
+  // Eliminates the old poses of the leaving submaps and some landmarks: those that come to rest, and those that are
+  // given up. runs: the leaving submaps in the order of their elimination where none has left before.
+  //
+  // A run of old poses touches only the landmarks seen along it and the poses at its ends. Each is eliminated from a
+  // dense quadratic over these, whose rest is a factor of the next run (George 1973, SIAM J. Numer. Anal. 10(2), by
+  // blocks). Throws sparse::NotPositiveDefinite.
+  Condensing condense(const std::vector<bool>& leaving, Indices resting, Indices given_up,
+                      const std::vector<std::vector<Index>>& runs) const;
+
+  // Of members of the map, by their node or, at rest, as −1 less their place there: points of landmarks, the
+  // covariance (xx, xy, xy, yy) of each, and mean and joint covariance. Fixed nodes have a covariance of zero.
+  //
+  // Of a landmark at rest x = means + gain d + e, Cov(x, z) = gain Cov(d, z) and Cov(x, x') = C + gain Cov(d, d) gainᵀ.
+  Numbers points(Indices members) const;
+  Numbers blocks(Indices members) const;
+  std::pair<Numbers, dense::Matrix> joint(Indices members) const;
 
  private:
   using Submaps = std::vector<std::shared_ptr<const Submap>>;
@@ -104,6 +114,15 @@ class Estimate {
   Numbers gates() const;           // of the submaps
   Numbers sighting_gates() const;
   Numbers moved(const Numbers& step, double share) const;
+  // The marked factors and the condensed one as one quadratic at this state, over these nodes, ascending; the
+  // factors' other nodes are constants.
+  Summed quadratic(Indices nodes, const Marked& marked) const;
+  Summed eliminate_paths(const std::vector<std::vector<Index>>& runs, Marked rest, const std::vector<bool>& eliminated,
+                         std::vector<Index>& nodes) const;
+  std::vector<std::size_t> places_of(Indices nodes) const;
+  const Numbers& resting_points() const;
+  const dense::Matrix& resting_spread() const;  // G R, with the gain G and R Rᵀ = Cov(d, d)
+  const dense::Matrix& boundary_covariance() const;
   Sighting::Linear linear(const Sighting& sighting) const {
     return sighting.linear(&state_[graph_->offset[sighting.observer]], &state_[graph_->offset[sighting.teammate]]);
   }
@@ -113,7 +132,8 @@ class Estimate {
   Loss loss_;
   // Made when they are first needed.
   mutable std::optional<Submaps> submaps_, discounted_;
-  mutable std::optional<Numbers> weights_, chi2_, sighting_chi2_, step_, covariance_;
+  mutable std::optional<Numbers> weights_, chi2_, sighting_chi2_, step_, covariance_, resting_points_;
+  mutable std::optional<dense::Matrix> resting_spread_, boundary_covariance_;
   mutable std::optional<std::pair<Numbers, Numbers>> landmark_chi2_, normal_;
   mutable std::optional<std::vector<Prior::Terms>> prior_terms_;
   mutable std::optional<Quadratic::Terms> condensed_terms_;

@@ -1,5 +1,6 @@
 #include "graph.hpp"
 
+#include <algorithm>
 #include <array>
 
 #include "models.hpp"
@@ -91,18 +92,6 @@ Prior::Terms Prior::terms(Values state, Indices offset) const {
   return found;
 }
 
-Quadratic::Terms Quadratic::terms(Values state, Indices numbers) const {
-  Numbers d(at.size());
-  for (std::size_t i = 0; i < d.size(); i++) {
-    d[i] = state[numbers[i]] - at[i];
-    if (is_heading[i]) d[i] = se2::wrapped(d[i]);
-  }
-  Terms found{0.0, dense::product(information, d)};
-  found.cost = cost + (2.0 * dense::inner(slope, d) + dense::inner(d, found.slope));
-  for (std::size_t i = 0; i < d.size(); i++) found.slope[i] = slope[i] + found.slope[i];
-  return found;
-}
-
 Graph::Graph(std::vector<Index> offsets, std::vector<bool> constants, std::vector<Joined> joined,
              std::vector<Sighting> seen, std::vector<Prior> known, std::shared_ptr<const Quadratic> old)
     : offset(checked(std::move(offsets), constants.size())),
@@ -125,10 +114,35 @@ Graph::Graph(std::vector<Index> offsets, std::vector<bool> constants, std::vecto
   }
   if (!condensed) return;
   for (const Index node : condensed->nodes) {
-    require(node >= 0 && std::size_t(node) < nodes(), "a condensed factor's member is no node of the graph");
+    require(node >= 0 && std::size_t(node) < nodes() && !fixed[node], "a condensed factor's member is no free node of the graph");
     for (Index i = offset[node]; i < offset[node + 1]; i++) boundary_.push_back(i);
   }
   require(boundary_.size() == condensed->at.size(), "the condensed factor has the size of its nodes");
+}
+
+void Graph::mark_path(std::size_t submap, std::vector<bool>& marks) const {
+  const Joined& at = submaps[submap];
+  marks[at.nodes[0]] = true;
+  for (std::size_t k = 2; k <= at.submap->poses(); k++) marks[at.nodes[k]] = true;
+}
+
+Marked Graph::touching(const std::vector<bool>& chosen, const std::vector<bool>& marks) const {
+  Marked found{chosen, {}, {}};
+  for (const Sighting& each : sightings) found.sightings.push_back(marks[each.observer] || marks[each.teammate]);
+  for (const Prior& each : priors)
+    found.priors.push_back(std::any_of(each.nodes.begin(), each.nodes.end(), [&](Index node) { return marks[node]; }));
+  return found;
+}
+
+void Graph::mark_nodes(const Marked& factors, std::vector<bool>& marks) const {
+  for (std::size_t f = 0; f < submaps.size(); f++)
+    if (factors.submaps[f])
+      for (const Index node : submaps[f].nodes) marks[node] = true;
+  for (std::size_t s = 0; s < sightings.size(); s++)
+    if (factors.sightings[s]) marks[sightings[s].observer] = marks[sightings[s].teammate] = true;
+  for (std::size_t k = 0; k < priors.size(); k++)
+    if (factors.priors[k])
+      for (const Index node : priors[k].nodes) marks[node] = true;
 }
 
 const Graph::Blocks& Graph::blocks() const {

@@ -7,8 +7,8 @@
 #include <memory>
 #include <optional>
 
+#include "condensed.hpp"
 #include "sparse.hpp"
-#include "submap_factor.hpp"
 
 namespace teamslam::graph {
 
@@ -55,22 +55,9 @@ struct Prior {
   Terms terms(Values state, Indices offset) const;
 };
 
-// Old factors, linearised: cost(x) = cost + 2 slopeᵀ d + dᵀ information d, d = x − at with headings
-// wrapped, over some nodes, ascending, none of them fixed.
-struct Quadratic {
-  struct Terms {
-    double cost = 0.0;
-    Numbers slope;  // half of the derivative
-  };
-
-  std::vector<Index> nodes;
-  Numbers at;
-  std::vector<bool> is_heading;
-  dense::Matrix information;
-  Numbers slope;
-  double cost;
-
-  Terms terms(Values state, Indices numbers) const;
+// Marks of factors, in the graph's order.
+struct Marked {
+  std::vector<bool> submaps, sightings, priors;
 };
 
 class Graph {
@@ -85,6 +72,13 @@ class Graph {
   std::size_t landmarks() const { return landmark_start.back(); }
   // The indices in the state of the numbers of the condensed factor's nodes.
   Indices boundary() const { return boundary_; }
+
+  // Marks the start pose of a submap and its pose nodes.
+  void mark_path(std::size_t submap, std::vector<bool>& nodes) const;
+  // Marks of these submaps, and of the other factors with a marked node.
+  Marked touching(const std::vector<bool>& submaps, const std::vector<bool>& nodes) const;
+  // Marks the nodes of the marked factors.
+  void mark_nodes(const Marked& factors, std::vector<bool>& nodes) const;
 
   // A block variable per node.
   const std::shared_ptr<const sparse::Pattern>& pattern() const;

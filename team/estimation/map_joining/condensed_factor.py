@@ -19,7 +19,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream
-from teamslam.team.shapes import Bool, Float, Int64
+from teamslam.team.shapes import Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
@@ -135,141 +135,57 @@ NOBODY = Departed({}, SubmapCosts(), {}, {})
 
 
 @dataclass(frozen=True, eq=False)
-class Resting:
-    """Landmarks that no raw submap contains, given the nodes of the condensed factor.
-
-    x ~ N(means + gain d, covariance), d as in `Condensed`; no nodes until a submap observes them.
-    ids: in the order in which they came to rest. covariance: its upper triangle, square (`upper`)
-    or packed.
-    """
-
-    ids: Indices
-    means: Values
-    gain: Float[np.ndarray, "r n"]
-    covariance: Float[np.ndarray, "r r"] | Values
-
-    @cached_property
-    def upper(self) -> Float[np.ndarray, "r r"]:
-        """The upper triangle of a square matrix; the rest is not read."""
-        if self.covariance.ndim == 2:
-            return self.covariance
-        return core.unpacked(self.covariance, len(self.means))
-
-    @property
-    def packed(self) -> "Resting":
-        """The same in half the memory."""
-        packed = core.packed(self.covariance) if self.covariance.ndim == 2 else self.covariance
-        return replace(self, covariance=packed)
-
-    @cached_property
-    def place(self) -> Mapping[int, int]:
-        """Place of each id."""
-        return {id_: k for k, id_ in enumerate(self.ids.tolist())}
-
-
-def make_empty_rest(numbers: int) -> Resting:
-    """Make an empty `Resting` beside a condensed factor."""
-    none = np.zeros(0)
-    return Resting(none.astype(np.int64), none, np.zeros((0, numbers)), np.zeros((0, 0)))
-
-
-@dataclass(frozen=True, eq=False)
 class Condensed:
-    """The quadratic cost of the module's equation over `nodes`, ascending, none of them fixed.
+    """The quadratic cost of the module's equation, over nodes none of which is fixed.
 
-    headings: which of its numbers are headings. submaps: number of submaps that it replaces.
-    redundancy: number of measured quantities less eliminated unknowns. resting: None if there have
-    never been any.
+    submaps: number of submaps that it replaces. redundancy: number of measured quantities less
+    eliminated unknowns. resting: ids of the landmarks at rest in the order of their places; None if
+    there have never been any.
     """
 
-    nodes: Indices
-    at: Values
-    headings: Bool[np.ndarray, " _"]
-    information: Float[np.ndarray, "n n"]
-    slope: Values
-    cost: float
+    factor: core.Quadratic
     submaps: int
     redundancy: int
     departed: Departed = field(default=NOBODY)
-    resting: Resting | None = None
+    resting: Indices | None = None
 
     @property
-    def packed(self) -> "Condensed":
-        """The same factor, to be stored."""
-        return self if self.resting is None else replace(self, resting=self.resting.packed)
-
-    def moved(self, state: Values, numbers: Indices) -> Values:
-        """Difference d = state − at, headings wrapped; numbers: `Graph.boundary`."""
-        d: Values = state[numbers] - self.at
-        turn = d[self.headings]
-        d[self.headings] = turn + 2.0 * np.pi * np.floor((np.pi - turn) / (2.0 * np.pi))
-        return d
+    def nodes(self) -> Indices:
+        """Its nodes in the graph."""
+        return self.factor.nodes
 
     @cached_property
-    def quadratic(self) -> core.Quadratic:
-        """The factor, to compute with."""
-        return core.Quadratic(
-            self.nodes, self.at, self.headings, self.information, self.slope, self.cost
+    def place(self) -> Mapping[int, int]:
+        """Place of each landmark at rest."""
+        ids = [] if self.resting is None else self.resting.tolist()
+        return {id_: k for k, id_ in enumerate(ids)}
+
+    def tied(self, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]) -> "Condensed":
+        """Merge landmarks into one node: the same cost where they are equal.
+
+        sizes: of each node. node_of: new number of each former node. becomes: that of each
+        renumbered landmark. The linearisation point is that of the first merged landmark.
+        """
+        departed = self.departed
+        if any(id_ in departed.believed for id_ in becomes):
+            believed = Counter[int]()
+            for id_, count in departed.believed.items():
+                believed[becomes.get(id_, id_)] += count
+            departed = departed._replace(believed=believed)
+        old, own = self.factor, sizes[self.nodes]
+        nodes, first, slot = np.unique(node_of[old.nodes], return_index=True, return_inverse=True)
+        begin = np.cumsum([0, *own[first]])[slot]
+        to = np.concatenate([np.arange(at, at + size) for at, size in zip(begin, own, strict=True)])
+        T = (to[:, None] == np.arange(to.max() + 1)).astype(np.float64)  # d = T d' + moved
+        first = T.argmax(axis=0)
+        moved = np.where(old.headings, 0.0, old.at[first][to] - old.at)
+        half = dense.product(old.information, moved)
+        factor = core.Quadratic(
+            nodes,
+            old.at[first],
+            old.headings[first],
+            dense.product(dense.product(T.T, old.information), T),
+            dense.product(T.T, old.slope + half),
+            old.cost + float(dense.product(2.0 * old.slope + half, moved)),
         )
-
-
-def places(offset: Indices, nodes: Indices) -> Indices:
-    """Indices in the state of the numbers of some nodes."""
-    sizes = offset[nodes + 1] - offset[nodes]
-    first = np.repeat(offset[nodes] - np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
-    found: Indices = first + np.arange(len(first))
-    return found
-
-
-def tie_nodes(
-    old: Condensed, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]
-) -> Condensed:
-    """Merge landmarks of the factor into one node: the same cost where they are equal.
-
-    node_of: new number of each former node. becomes: that of each renumbered landmark. The
-    linearisation point is that of the first merged landmark.
-    """
-    departed = old.departed
-    if any(id_ in departed.believed for id_ in becomes):
-        believed: dict[int, int] = {}
-        for id_, count in departed.believed.items():
-            now = becomes.get(id_, id_)
-            believed[now] = believed.get(now, 0) + count
-        departed = departed._replace(believed=believed)
-    now = node_of[old.nodes]
-    if (np.diff(now) > 0).all():
-        return replace(old, nodes=now, departed=departed)
-    nodes, at = np.unique(now, return_index=True)
-    own = sizes[old.nodes]
-    begin = np.concatenate([[0], np.cumsum(own[at])])
-    to = places(begin, np.searchsorted(nodes, now))
-    _, first = np.unique(to, return_index=True)
-    moved = old.at[first][to] - old.at
-    moved[old.headings] = 0.0
-    half = dense.product(old.information, moved)
-    others = np.setdiff1d(np.arange(len(to)), first)
-    information = old.information[np.ix_(first, first)]
-    np.add.at(information, to[others], old.information[np.ix_(others, first)])
-    np.add.at(information.T, to[others], old.information[np.ix_(others, first)])
-    corner = np.ix_(to[others], to[others])
-    np.add.at(information, corner, old.information[np.ix_(others, others)])
-    slope = np.zeros(len(first))
-    np.add.at(slope, to, old.slope + half)
-    return replace(
-        old,
-        nodes=nodes,
-        at=old.at[first],
-        headings=old.headings[first],
-        information=information,
-        slope=slope,
-        cost=old.cost + float(2.0 * dense.product(old.slope, moved) + dense.product(moved, half)),
-        departed=departed,
-    )
-
-
-def between(upper: Matrix, rows: Indices, columns: Indices) -> Float[np.ndarray, "r c"]:
-    """Return some rows and columns of a symmetric matrix stored as upper triangle."""
-    entries: Float[np.ndarray, "r c"] = upper[
-        np.minimum.outer(rows, columns), np.maximum.outer(rows, columns)
-    ]
-    return entries
+        return replace(self, factor=factor, departed=departed)

@@ -1,8 +1,10 @@
 """The bounded fold: old submaps become one quadratic, selected by sequence number only.
 
 The last `lag` submaps of each stream of the main island stay factors. Older ones become one
-quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`). The
-cost of a tick depends on the number of landmarks and robots, not on the duration of the run.
+quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`). A
+landmark that no raw submap contains comes to rest: given the other nodes it is a Gaussian,
+eliminated like an old pose, until a submap observes it again. So the cost of a tick depends on the
+landmarks near the robots only, not on the duration of the run.
 
 No submap is condensed before the fold has `begin` submaps, before its robust scale is final, or in
 an unmerged island, whose frame will still be transformed.
@@ -22,26 +24,25 @@ from teamslam.team.estimation.map_joining.condensed_factor import (
     Condensed,
     Departed,
     EliminatedPath,
-    places,
     select_newest,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, terms
 from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
-from teamslam.team.estimation.map_joining.path_elimination import (
-    MarkedFactors,
-    eliminate_paths,
-    nodes_of,
-)
-from teamslam.team.estimation.map_joining.resting import FIRST, eliminate, find_idle, put_to_rest
 from teamslam.team.estimation.map_joining.submap_graph import Graph, remove_nodes
 from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
 T = TypeVar("T")
 
+FIRST = 64
+"""Number of landmarks without a raw submap from which landmarks come to rest: fewer cost less as
+nodes.
+"""
 ALL_AWAKE = 2**62
+RUN = 16
+"""Number of submaps whose poses are eliminated together."""
 
 
 class Limits(NamedTuple):
@@ -164,38 +165,26 @@ def _condense_island(
     given_up: Indices,
 ) -> Island:
     graph, before = island.graph, island.graph.condensed
-    rests = find_idle(graph, ~leaving, apart, first)
-    eliminated = _mark_eliminated(graph, leaving)
-    eliminated[rests] = eliminated[given_up] = True
-    out = eliminated.tolist()
-    seen = np.array([out[each.observer] or out[each.teammate] for each in graph.sightings], bool)
-    prior = np.array([any(out[node] for node in each.nodes) for each in graph.priors], bool)
-    factors = MarkedFactors(leaving, seen, prior)
-    union = nodes_of(island, factors, [] if before is None else [before.nodes])
-    sizes = np.diff(graph.offset)
-    unknowns = int(sizes[union[eliminated[union]]].sum())
-    if before is None:
-        union, H, g, cost = eliminate_paths(island, union, factors, eliminated)
-    else:
-        H, g, cost = island.estimate.quadratic(union, *factors)
-    parts = eliminate(H, g, np.repeat(eliminated[union], sizes[union]))
-    left, node_of = remove_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
-    remaining = union[~eliminated[union]]
-    numbers = places(graph.offset, remaining)
+    rests = _find_idle(graph, ~leaving, apart, first)
+    with island.determined():
+        factor, eliminated, unknowns, seen, prior = island.estimate.condense(
+            leaving, rests, given_up, _list_runs(graph, leaving)
+        )
     measured = int(graph.dimensions[leaving].sum()) + 2 * int(seen.sum())
     measured += sum(graph.priors[k].rank for k in np.flatnonzero(prior))
+    resting = None if before is None else before.resting
+    if len(rests):
+        id_of = {node: id_ for id_, node in graph.landmarks.items()}
+        ids = np.array([id_of[node] for node in rests.tolist()], np.int64)
+        resting = ids if resting is None else np.concatenate([resting, ids])
     made = Condensed(
-        nodes=node_of[remaining],
-        at=island.state[numbers],
-        headings=np.isin(numbers, graph.headings),
-        information=parts.information,
-        slope=parts.slope,
-        cost=cost - parts.lowered,
+        factor=factor,
         submaps=int(leaving.sum()) + (0 if before is None else before.submaps),
         redundancy=measured - unknowns + (0 if before is None else before.redundancy),
         departed=_sum_departed(island, leaving, seen, prior, given_up),
-        resting=put_to_rest(island, union, parts, rests),
+        resting=resting,
     )
+    left = remove_nodes(graph, eliminated, ~leaving, ~seen, ~prior)
     stays = np.repeat(~eliminated, np.diff(graph.offset))
     return Island(
         replace(left, condensed=made),
@@ -206,14 +195,29 @@ def _condense_island(
     )
 
 
-def _mark_eliminated(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " _"]:
-    """Mark the nodes that no later factor can contain."""
-    eliminated = np.zeros(len(graph.fixed), np.bool_)
-    for f in np.flatnonzero(leaving):
-        contribution, nodes, *_ = graph.submaps[f]
-        eliminated[nodes[0]] = True
-        eliminated[nodes[2 : 2 + len(contribution.local.node_stamps)]] = True
-    return eliminated
+def _find_idle(
+    graph: Graph, stays: Bool[np.ndarray, " F"], apart: Collection[int], first: int
+) -> Indices:
+    """List the nodes of landmarks that come to rest, ascending: in no submap that stays nor in
+    another island (`apart`).
+
+    None while no landmark rests yet and fewer than `first` could.
+    """
+    seen = {*graph.landmark_nodes[np.repeat(stays, np.diff(graph.landmark_start))].tolist()}
+    found = sorted(n for id_, n in graph.landmarks.items() if n not in seen and id_ not in apart)
+    some_rest = graph.condensed is not None and graph.condensed.resting is not None
+    return np.array(found if some_rest or len(found) >= first else [], np.int64)
+
+
+def _list_runs(graph: Graph, leaving: Bool[np.ndarray, " F"]) -> list[Indices]:
+    streams: dict[Stream, list[int]] = defaultdict(list)
+    for f in np.flatnonzero(leaving).tolist():
+        streams[graph.submaps[f].contribution.stream].append(f)
+    return [
+        np.array(own[k : k + RUN], np.int64)
+        for _, own in sorted(streams.items())
+        for k in range(0, len(own), RUN)
+    ]
 
 
 def _sum_departed(

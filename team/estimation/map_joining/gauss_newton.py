@@ -209,43 +209,6 @@ class Island:
         with self.determined():
             return self.estimate.selected_covariance
 
-    @cached_property
-    def resting_points(self) -> Float[np.ndarray, "L 2"]:
-        """Positions [m] of the landmarks at rest."""
-        old = self.graph.condensed
-        assert old is not None
-        assert old.resting is not None
-        moved = old.moved(self.state, self.graph.boundary)
-        points: Values = old.resting.means + dense.product(old.resting.gain, moved)
-        return points.reshape(-1, 2)
-
-    @cached_property
-    def boundary_covariance(self) -> Float[np.ndarray, "n n"]:
-        """Joint covariance of the condensed factor's nodes."""
-        with self.determined():
-            return self.estimate.boundary_covariance
-
-    @cached_property
-    def resting_spread(self) -> Float[np.ndarray, "r n"]:
-        """G R, with the gain G of the landmarks at rest and R Rᵀ of the nodes that they
-        depend on.
-        """
-        old = self.graph.condensed
-        assert old is not None
-        assert old.resting is not None
-        spread = np.zeros(old.resting.gain.shape)
-        root = dense.cholesky(self.boundary_covariance)
-        core.add_product(old.resting.gain, root, spread, lower=True)
-        return spread
-
-    @cached_property
-    def resting_blocks(self) -> Float[np.ndarray, "L 2 2"]:
-        """Covariance [m²] of each landmark at rest."""
-        old = self.graph.condensed
-        assert old is not None
-        assert old.resting is not None
-        return core.own_blocks(old.resting.upper, self.resting_spread)
-
 
 def age_factors(island: Island, iterations: int | None) -> Island:
     """Add iterations to the age of every factor; None: begin anew."""
@@ -409,12 +372,7 @@ def solve_with_fixed(
 
 
 def joint_marginal(island: Island, nodes: Sequence[int]) -> tuple[Values, Float[np.ndarray, "n n"]]:
-    """Compute mean and joint covariance of `nodes`; 0 for a fixed node."""
-    graph = island.graph
-    spans = [np.arange(graph.offset[node], graph.offset[node + 1]) for node in nodes]
-    unknowns = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
-    covariance = island.posterior.inverse_block(unknowns)
-    constant = np.repeat(graph.fixed[list(nodes)], [len(span) for span in spans])
-    covariance[constant] = 0.0
-    covariance[:, constant] = 0.0
-    return island.state[unknowns], covariance
+    """Compute mean and joint covariance of nodes (`landmark_view.members`); 0 for a fixed one."""
+    with island.determined():
+        mean, covariance = island.estimate.joint(np.array(nodes, np.int64))
+    return mean, covariance

@@ -48,6 +48,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     is_suspicious,
     iterate_tick,
 )
+from teamslam.team.estimation.map_joining.landmark_view import wake_landmarks
 from teamslam.team.estimation.map_joining.markers import add_markers, warn_of_unmarked
 from teamslam.team.estimation.map_joining.merging import Merge, merge
 from teamslam.team.estimation.map_joining.minima import (
@@ -58,7 +59,6 @@ from teamslam.team.estimation.map_joining.minima import (
     warnings,
     widen_search,
 )
-from teamslam.team.estimation.map_joining.resting import wake_landmarks
 from teamslam.team.estimation.map_joining.saved_maps import (
     FALSE_ALARM,
     SEQUENTIAL,
@@ -334,14 +334,11 @@ def fold_submaps(
 def compact_fold(fold: Fold) -> Fold:
     """Drop the values of a fold that can be computed again, for a checkpoint.
 
-    The submaps are shared with other folds; the state, the graph's nodes and the packed condensed
-    factor remain.
+    The submaps are shared with other folds; the state and the graph's nodes and factors remain.
     """
-    islands = {}
-    for key, island in fold.islands.items():
-        old = island.graph.condensed
-        graph = replace(island.graph, condensed=None if old is None else old.packed)
-        islands[key] = replace(island, graph=graph)
+    islands = {
+        key: replace(island, graph=replace(island.graph)) for key, island in fold.islands.items()
+    }
     return replace(fold, islands=islands)
 
 

@@ -23,7 +23,6 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import (
     blocks_of,
     joint,
-    joints,
     known,
     points_of,
 )
@@ -291,11 +290,10 @@ def main_priors(
 def _priors_in(
     island: Island, landmarks_of: Mapping[Stream, Sequence[int]]
 ) -> dict[Stream, RobotPrior]:
-    streams = island.graph.streams
-    found = joints(island, [([streams[of][-1]], ids) for of, ids in landmarks_of.items()])
     biases = _biases_in(island)
     priors = {}
-    for (stream, ids), (mean, covariance) in zip(landmarks_of.items(), found, strict=True):
+    for stream, ids in landmarks_of.items():
+        mean, covariance = joint(island, island.graph.streams[stream][-1:], ids)
         own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
         priors[stream] = RobotPrior(
             mean[:3],

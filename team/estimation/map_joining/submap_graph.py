@@ -29,7 +29,7 @@ from teamslam.team.estimation.contribution import (
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.condensed_factor import Condensed, places, tie_nodes
+from teamslam.team.estimation.map_joining.condensed_factor import Condensed
 from teamslam.team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.estimation.submap import LocalMap
@@ -228,7 +228,7 @@ class Graph:
             [(each.factor, each.nodes) for each in self.submaps],
             [(a, b, x.measurement, x.information, x.point) for x, a, b in self.sightings],
             [(np.array(x.nodes), x.mean, x.information, x.is_of_robot) for x in self.priors],
-            None if self.condensed is None else self.condensed.quadratic,
+            None if self.condensed is None else self.condensed.factor,
         )
 
     @cached_property
@@ -240,12 +240,6 @@ class Graph:
     def saved_maps(self) -> Indices:
         """Indices of the submaps that are saved maps."""
         return np.flatnonzero([is_map(each.contribution.stream) for each in self.submaps])
-
-    @cached_property
-    def boundary(self) -> Indices:
-        """Indices in the state of the condensed factor's numbers."""
-        nodes = np.zeros(0, np.int64) if self.condensed is None else self.condensed.nodes
-        return places(self.offset, nodes)
 
     @cached_property
     def landmark_start(self) -> Indices:
@@ -531,9 +525,9 @@ def remove_nodes(
     submaps: Bool[np.ndarray, " F"],
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
-) -> tuple[Graph, Indices]:
+) -> Graph:
     """Remove eliminated poses (a stream's first) and landmarks; keep the marked factors, but no
-    condensed one; return each node's new number.
+    condensed one.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
     streams, gone, out = {}, dict(graph.gone), eliminated.tolist()
@@ -553,7 +547,7 @@ def remove_nodes(
         condensed=None,
         gone=gone,
     )
-    return _renumber_nodes(left, node_of, ~eliminated), node_of
+    return _renumber_nodes(left, node_of, ~eliminated)
 
 
 def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
@@ -711,7 +705,7 @@ def tie_landmarks(graph: Graph, state: Values, becomes: Mapping[int, int]) -> tu
     renamed = replace(
         graph,
         landmarks=first,
-        condensed=None if old is None else tie_nodes(old, sizes, node_of, becomes),
+        condensed=None if old is None else old.tied(sizes, node_of, becomes),
     )
     return _renumber_nodes(renamed, node_of, remaining), state[np.repeat(remaining, sizes)]
 

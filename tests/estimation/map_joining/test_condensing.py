@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from teamslam.team import core
 from teamslam.team.estimation.map_joining import (
     marginals,
 )
@@ -80,8 +81,11 @@ def test_a_submap_that_is_condensed_twice_is_not_consistent():
     full, bounded = both(world, JoinSettings())
     island = bounded.main
     old = island.graph.condensed
-    twice = replace(old, information=2.0 * old.information, slope=2.0 * old.slope)
-    wrong = replace(island, graph=replace(island.graph, condensed=twice))
+    one = old.factor
+    twice = core.Quadratic(
+        one.nodes, one.at, one.headings, 2.0 * one.information, 2.0 * one.slope, one.cost
+    )
+    wrong = replace(island, graph=replace(island.graph, condensed=replace(old, factor=twice)))
     claimed = replace(bounded, islands={bounded.main_key: wrong})
     variances = [np.diag(marginals.landmark_map(each).covariance) for each in (full, claimed)]
     assert not np.allclose(*variances, rtol=0.05)

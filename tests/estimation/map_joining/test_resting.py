@@ -37,7 +37,7 @@ def folds(found, settings, first, starts=None):
 
 
 def at_rest(fold):
-    return set(landmark_view.resting_of(fold.main).ids.tolist())
+    return set(landmark_view.resting(fold.main))
 
 
 @pytest.mark.parametrize(
