@@ -17,9 +17,6 @@ from teamslam.team.shapes import Float
 MEDIAN_PRICE = 1.3
 """Ratio of the scatter of a χ² median of a few degrees of freedom to that of its mean."""
 
-FEW = 600
-"""Degrees of freedom up to which the finite sum of χ² neither underflows nor takes long."""
-
 
 def state_error(
     estimate: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]
@@ -41,29 +38,9 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 def chi2_limit(dof: int, tail: float) -> float:
     """Value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
-    Rounded to twelve digits. For few degrees by bisection of the finite sum (Abramowitz & Stegun
-    26.4.4, 26.4.5).
+    Rounded to twelve digits.
     """
-    if dof > FEW:
-        return float(f"{core.chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
-    low, high = 0.0, float(max(dof, 1))
-    while _chi2_tail(high, dof) > tail:
-        high *= 2.0
-    while low < (middle := 0.5 * (low + high)) < high:
-        low, high = (middle, high) if _chi2_tail(middle, dof) > tail else (low, middle)
-    return float(f"{high:.12g}")
-
-
-def _chi2_tail(value: float, dof: int) -> float:
-    half = 0.5 * value
-    term, total = math.exp(-half), 0.0
-    if dof % 2:
-        total = math.erfc(math.sqrt(half))
-        term *= 2.0 * math.sqrt(half / math.pi)
-    for k in range(dof // 2):
-        total += term
-        term *= half / (k + 1.0 + 0.5 * (dof % 2))
-    return total
+    return float(f"{core.chi2_quantiles(1.0 - tail, tail, np.array([float(dof)]))[0]:.12g}")
 
 
 def chi2_quantile(

@@ -145,16 +145,9 @@ class LocalMap:
         if not len(self.ids) or self.ids[-1] < UNNAMED:
             return self
         named = int(np.searchsorted(self.ids, UNNAMED))
-        size = len(self.mean) - 2 * (len(self.ids) - named)
-        return replace(
-            self,
-            ids=self.ids[:named],
-            mean=self.mean[:size],
-            covariance=self.covariance[:size, :size],
-            sensitivity=self.sensitivity[:, :size] if self.biases else NO_COLUMNS,
-            curvature=self.curvature[:, :size] if self.biases else NO_COLUMNS,
-            unnamed=NONE_UNNAMED,
-        )
+        numbers = np.arange(len(self.mean) - 2 * (len(self.ids) - named))
+        part = self._part(numbers, self.node_stamps)
+        return replace(part, ids=self.ids[:named], unnamed=NONE_UNNAMED)
 
     @property
     def motion(self) -> "LocalMap":
@@ -175,12 +168,18 @@ class LocalMap:
             return self
         behind = 3 + 3 * len(self.node_stamps)
         numbers = np.concatenate([np.arange(3), np.arange(behind, len(self.mean))])
+        return self._part(numbers, NO_NODES)
+
+    def _part(
+        self, numbers: Int64[np.ndarray, " m"], stamps: Int64[np.ndarray, " _"]
+    ) -> "LocalMap":
         return LocalMap(
             self.ids,
             self.mean[numbers],
             self.covariance[np.ix_(numbers, numbers)],
-            biases=self.biases,
-            sensitivity=self.sensitivity[:, numbers] if self.biases else NO_COLUMNS,
-            curvature=self.curvature[:, numbers] if self.biases else NO_COLUMNS,
-            unnamed=self.unnamed,
+            stamps,
+            self.biases,
+            self.sensitivity[:, numbers] if self.biases else NO_COLUMNS,
+            self.unnamed,
+            self.curvature[:, numbers] if self.biases else NO_COLUMNS,
         )

@@ -11,9 +11,9 @@ an unmerged island, whose frame will still be transformed.
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,13 +28,12 @@ from teamslam.team.estimation.map_joining.condensed_factor import (
 )
 from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, Island
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.map_joining.marginals import BELIEVED, Terms, terms
+from teamslam.team.estimation.map_joining.marginals import BELIEVED, terms
 from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
 from teamslam.team.estimation.map_joining.submap_graph import Graph, remove_nodes
 from teamslam.team.shapes import Bool, Int64
 
 Indices = Int64[np.ndarray, " _"]
-T = TypeVar("T")
 
 FIRST = 64
 """Number of landmarks without a raw submap from which landmarks come to rest: fewer cost less as
@@ -241,7 +240,7 @@ def _sum_departed(
     for node in given_up.tolist():
         believed.pop(id_of[node], None)
     submaps = before.submaps.followed_by(now.submaps.select(np.flatnonzero(leaving).tolist()))
-    robots = _sums(before, now, leaving, seen, prior)
+    robots = now.add_to(before.robots, np.concatenate([leaving, prior, seen]))
     return Departed(robots, select_newest(submaps), believed, _paths(island, before, leaving))
 
 
@@ -259,25 +258,3 @@ def _paths(
         old = paths.get(stream, EliminatedPath((), bool(graph.fixed[nodes[0]])))
         paths[stream] = old.longer(poses)
     return paths
-
-
-def _sums(
-    before: Departed,
-    now: Terms,
-    leaving: Bool[np.ndarray, " F"],
-    seen: Bool[np.ndarray, " S"],
-    prior: Bool[np.ndarray, " priors"],
-) -> dict[str, tuple[float, float]]:
-    robots = dict(before.robots)
-    for robot, chi2, dof in (
-        *_select(now.counted, leaving),
-        *_select(now.priors, prior),
-        *_select(now.sightings, seen),
-    ):
-        sums = robots.get(robot, (0.0, 0.0))
-        robots[robot] = (sums[0] + chi2, sums[1] + dof)
-    return robots
-
-
-def _select(items: Sequence[T], which: Bool[np.ndarray, " _"]) -> Iterable[T]:
-    return (items[k] for k in np.flatnonzero(which).tolist())

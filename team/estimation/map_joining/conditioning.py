@@ -29,7 +29,7 @@ from teamslam.team.estimation.gaussian import (
     PoseGaussian,
 )
 from teamslam.team.estimation.submap import LocalMap
-from teamslam.team.shapes import Bool, Float, Int64, UInt32
+from teamslam.team.shapes import Bool, Float, UInt32
 
 INDEFINITE, SINGULAR = 1, 2
 """Faults of the core: the covariance of the innovation of all known landmarks is not positive
@@ -61,22 +61,6 @@ def _raise_fault(fault: int) -> None:
         raise NotACovarianceError("the known landmarks' innovation", "not positive definite")
     if fault == SINGULAR:
         raise NotACovarianceError("a known landmark's innovation", "singular")
-
-
-def remove_landmark(local: LocalMap, place: int) -> LocalMap:
-    """Remove the landmark at this index from the local map."""
-    rows = np.delete(np.arange(len(local.mean)), _coordinates(local, np.array([place])))
-    ids = np.delete(local.ids, place)
-    covariance = local.covariance[np.ix_(rows, rows)]
-    return LocalMap(ids, local.mean[rows], covariance, local.node_stamps)
-
-
-def _coordinates(local: LocalMap, index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    return len(local.mean) - 2 * len(local.ids) + _points(index)
-
-
-def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    return (2 * index[:, None] + np.arange(2)).ravel()
 
 
 GATE = 18.420680744107813
@@ -189,7 +173,7 @@ def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
         refused = tuple(int(each.sum()) for each in beyond)
         if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
             found = _solve_chain(
-                whole, [_remove_landmarks(*pair) for pair in zip(submaps, beyond, strict=True)]
+                whole, [remove_landmarks(*pair) for pair in zip(submaps, beyond, strict=True)]
             )
     joint = found.map
     disputed = found.cost > _largest_cost(found.dof) or any(
@@ -224,10 +208,13 @@ def _largest_cost(dof: int) -> float:
     return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
 
 
-def _remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
-    for place in np.flatnonzero(beyond)[::-1]:
-        local = remove_landmark(local, int(place))
-    return local
+def remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
+    """Remove the marked landmarks from a local map."""
+    stays = np.concatenate(
+        [np.ones(len(local.mean) - 2 * len(beyond), np.bool_), np.repeat(~beyond, 2)]
+    )
+    covariance = local.covariance[np.ix_(stays, stays)]
+    return LocalMap(local.ids[~beyond], local.mean[stays], covariance, local.node_stamps)
 
 
 def compose_pose(whole: WholeMap, open_window: WholeMap | None) -> Posed:

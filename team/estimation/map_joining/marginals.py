@@ -6,7 +6,7 @@ In the frame of an island: the main one, or that of a stream.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import compress, pairwise, repeat
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -26,7 +26,8 @@ from teamslam.team.estimation.map_joining.landmark_view import (
     known,
     points_of,
 )
-from teamslam.team.shapes import Float, UInt32
+from teamslam.team.estimation.map_joining.submap_graph import Graph
+from teamslam.team.shapes import Bool, Float, UInt32
 
 BELIEVED = 0.5
 """Least weight of a landmark in a submap for the submap to be believed about it."""
@@ -326,15 +327,27 @@ def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
 
 
 class Terms(NamedTuple):
-    """The agreement of each factor, in the graph's order.
+    """The agreement of each factor: submaps, then priors, then inter-robot measurements.
 
-    submaps: without discounts. counted, priors, sightings: (robot, w χ², dof) of the joint cost.
+    submaps: without discounts. robots: of each factor. counted: rows w χ² and dof of the joint
+    cost.
     """
 
     submaps: SubmapCosts
-    counted: list[tuple[str, float, float]]
-    priors: list[tuple[str, float, float]]
-    sightings: list[tuple[str, float, float]]
+    robots: tuple[str, ...]
+    counted: Float[np.ndarray, "2 n"]
+
+    def add_to(
+        self, before: Mapping[str, tuple[float, float]], which: Bool[np.ndarray, " n"] | None = None
+    ) -> dict[str, tuple[float, float]]:
+        """Add all or some factors to the Σ w χ² and Σ dof of each robot."""
+        robots = dict(before)
+        marks = repeat(True) if which is None else which.tolist()
+        of = zip(self.robots, *self.counted.tolist(), strict=True)
+        for robot, chi2, dof in compress(of, marks):
+            sums = robots.get(robot, (0.0, 0.0))
+            robots[robot] = (sums[0] + chi2, sums[1] + dof)
+        return robots
 
 
 _TERMS: WeakKeyDictionary[Island, Terms] = WeakKeyDictionary()
@@ -351,20 +364,37 @@ def terms(island: Island) -> Terms:
 
 
 def _terms(island: Island) -> Terms:
-    graph = island.graph
-    now = island.estimate
+    graph, now = island.graph, island.estimate
     weight = now.weights
     taken = weight * now.explained
-    of = [each.contribution for each in graph.submaps]
     left = graph.dimensions - taken
+    of = [each.contribution for each in graph.submaps]
     costs = np.array([now.whole_chi2, left, weight, chi2_quantile(0.5, left)])
-    counted = (weight * now.counted_chi2).tolist(), (now.dimensions - taken).tolist()
-    return Terms(
-        SubmapCosts(tuple(each.stream for each in of), costs),
-        [(each.robot, *rest) for each, *rest in zip(of, *counted, strict=True)],
-        _priors(island),
-        _sightings(island),
+    ranks = np.array([each.rank for each in graph.priors], np.int64)
+    of_priors, of_sightings = now.prior_weights, now.sighting_weights
+    counted = (
+        [weight * now.counted_chi2, now.dimensions - taken],
+        [of_priors * now.prior_chi2, ranks - of_priors * now.explained_by_priors],
+        [
+            of_sightings * now.sighting_chi2,
+            2.0 - of_sightings * now.explained_by_sightings,
+        ],
     )
+    robots = (
+        *(each.robot for each in of),
+        *_robots_of_priors(graph),
+        *(each.sighting.robot for each in graph.sightings),
+    )
+    return Terms(SubmapCosts(tuple(each.stream for each in of), costs), robots, np.hstack(counted))
+
+
+def _robots_of_priors(graph: Graph) -> list[str]:
+    """Return the robot of each prior; a common bias counts for the frame's."""
+    robots = {nodes[0]: stream[0] for stream, nodes in graph.streams.items()}
+    robots |= {node: stream[0] for (stream, _), node in graph.biases.items()}
+    robots |= {node: stream[0] for (stream, _), node in graph.remembered.items()}
+    robots |= dict.fromkeys(graph.common.values(), min(graph.streams)[0])
+    return [robots[each.nodes[0]] for each in graph.priors]
 
 
 def scale_of(costs: SubmapCosts, of: Sequence[int] | slice = ALL) -> Scale | None:
@@ -431,10 +461,7 @@ def joint_cost(fold: Fold) -> Agreement:
     found = terms(fold.main)
     old = fold.main.graph.condensed
     departed = NOBODY if old is None else old.departed
-    robots = dict(departed.robots)
-    for robot, chi2, own in (*found.counted, *found.priors, *found.sightings):
-        before = robots.get(robot, (0.0, 0.0))
-        robots[robot] = (before[0] + chi2, before[1] + own)
+    robots = found.add_to(departed.robots)
     chi2 = sum(robots[robot][0] for robot in sorted(robots))
     total = sum(robots[robot][1] for robot in sorted(robots))
     return Agreement(
@@ -458,32 +485,8 @@ def _own_marginal(
     return _mean(island, node), np.zeros_like(block) if fixed else block
 
 
-def _sightings(island: Island) -> list[tuple[str, float, float]]:
-    """(observer, w χ², dof) of each inter-robot measurement."""
-    now = island.estimate
-    weight = now.sighting_weights
-    chi2, dof = weight * now.sighting_chi2, 2.0 - weight * now.explained_by_sightings
-    observers = [each.sighting.robot for each in island.graph.sightings]
-    return list(zip(observers, chi2.tolist(), dof.tolist(), strict=True))
-
-
 def _sighting_costs(island: Island) -> list[SightingCost]:
     seen = zip(island.graph.sightings, island.estimate.sighting_chi2.tolist(), strict=True)
     costs = [(each.sighting, chi2) for each, chi2 in seen]
     costs.sort(key=lambda each: each[0].key)
     return [SightingCost(of.robot, of.teammate, chi2) for of, chi2 in costs]
-
-
-def _priors(island: Island) -> list[tuple[str, float, float]]:
-    """(robot, χ², dof) of each prior; a common bias counts for the frame's robot."""
-    graph = island.graph
-    robots = {nodes[0]: stream[0] for stream, nodes in graph.streams.items()}
-    robots |= {node: stream[0] for (stream, _), node in graph.biases.items()}
-    robots |= {node: stream[0] for (stream, _), node in graph.remembered.items()}
-    robots |= dict.fromkeys(graph.common.values(), min(graph.streams)[0])
-    now = island.estimate
-    sizes = np.array([each.rank for each in graph.priors], np.int64)
-    weight = now.prior_weights
-    chi2, dof = weight * now.prior_chi2, sizes - weight * now.explained_by_priors
-    of = [robots[each.nodes[0]] for each in graph.priors]
-    return list(zip(of, chi2.tolist(), dof.tolist(), strict=True))

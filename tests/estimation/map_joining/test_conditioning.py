@@ -11,7 +11,7 @@ from teamslam.team.estimation.map_joining.conditioning import (
     SubmapCorrection,
     compose_pose,
     join_pending,
-    remove_landmark,
+    remove_landmarks,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import (
     JoinSettings,
@@ -142,7 +142,9 @@ def test_a_misread_landmark_leaves_the_pose_as_it_is_without_it(seed, monkeypatc
     first, second = (each.local for each in after)
     known = [k for k, id_ in enumerate(second.ids.tolist()) if id_ in prior.ids]
     place = known[0]
-    expected, covariance = team_pose(prior, [first], remove_landmark(second, place))
+    expected, covariance = team_pose(
+        prior, [first], remove_landmarks(second, np.arange(len(second.ids)) == place)
+    )
     wrong = misread(second, place, np.array([4.0, -3.0]))
     pose, spread = team_pose(prior, [first], wrong)
     np.testing.assert_array_equal(pose, expected)

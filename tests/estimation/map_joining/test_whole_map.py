@@ -10,7 +10,7 @@ from teamslam.team.estimation.map_joining.conditioning import (
     compose_pose,
     initial_map,
     join_submap,
-    remove_landmark,
+    remove_landmarks,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.joining import (
@@ -99,7 +99,7 @@ def test_the_end_pose_is_that_of_joining_without_the_landmark_that_the_gate_leav
     moved = local.mean.copy()
     moved[entry] += 40.0 * np.sqrt(local.covariance[entry, entry] + whole.covariance.max())
     pose, seen, refused = compose_pose(whole, map_of(replace(local, mean=moved)))
-    expected = join_submap(whole, remove_landmark(local, bad))
+    expected = join_submap(whole, remove_landmarks(local, np.arange(len(local.ids)) == bad))
     assert (seen, refused) == (len(known), 1)
     np.testing.assert_allclose(pose.mean, expected.mean[:3], rtol=1e-12)
     np.testing.assert_allclose(pose.covariance, expected.covariance[:3, :3], rtol=1e-9)
