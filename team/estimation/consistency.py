@@ -21,7 +21,7 @@ MEDIAN_PRICE = 1.3
 def state_error(
     estimate: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Error of a state (x [m], y [m], theta [rad], …), theta's in (−π, π]."""
+    """Compute the error of a state (x [m], y [m], theta [rad], …), theta's in (−π, π]."""
     error: Float[np.ndarray, " n"] = estimate - truth
     error[2] += 2.0 * np.pi * np.floor((np.pi - error[2]) / (2.0 * np.pi))
     return error
@@ -36,7 +36,7 @@ def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -
 
 @lru_cache
 def chi2_limit(dof: int, tail: float) -> float:
-    """Value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
+    """Return the value that χ² of `dof` degrees of freedom exceeds with the probability `tail`.
 
     Rounded to twelve digits.
     """
@@ -46,7 +46,7 @@ def chi2_limit(dof: int, tail: float) -> float:
 def chi2_quantile(
     probability: float, dof: Float[np.ndarray, " n"] | float | int
 ) -> Float[np.ndarray, " n"] | float:
-    """Value that χ² of `dof` degrees of freedom does not exceed with this probability.
+    """Return the value that χ² of `dof` degrees of freedom does not exceed with this probability.
 
     NaN for dof < 1. Rounded to 36 bits.
     """
@@ -59,8 +59,8 @@ def chi2_quantile(
 
 
 def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float]:
-    """Two-sided interval of the mean over `runs` of NEES/dof; the sum is χ² with dof·runs degrees
-    of freedom.
+    """Compute the two-sided interval of the mean of NEES/dof over `runs`: χ² of
+    dof·runs degrees.
     """
     tail = 0.5 * (1.0 - probability)
     total = dof * runs
@@ -70,7 +70,7 @@ def chi2_interval(dof: int, probability: float, runs: int) -> tuple[float, float
 def coverage(
     nees_values: Float[np.ndarray, " runs"], dof: Float[np.ndarray, " runs"], probability: float
 ) -> float:
-    """Share of runs with a NEES in the ellipsoid of this probability."""
+    """Return the share of runs with a NEES in the ellipsoid of this probability."""
     return float(np.mean(nees_values <= chi2_quantile(probability, dof)))
 
 

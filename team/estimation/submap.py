@@ -19,8 +19,8 @@ class Unnamed:
     """Observations of a window's U unnamed landmarks, by ascending number.
 
     counts: measurements of each, at least 1. seen: keyframes that observed it; two landmarks in one
-    keyframe are distinct. classes: ln P(its reported classes | class), up to a constant; without
-    columns where none is reported.
+    keyframe are distinct. classes: ln P(its reported classes | class), up to a constant; no columns
+    without reports.
     """
 
     counts: UInt32[np.ndarray, " U"]
@@ -29,7 +29,7 @@ class Unnamed:
 
     @cached_property
     def views(self) -> tuple[Int64[np.ndarray, " _"], ...]:
-        """Largest sets of at least three landmarks that one keyframe saw, ascending."""
+        """Largest sets of at least three landmarks that one keyframe observed, ascending."""
         seen = np.unique(self.seen.astype(np.float64), axis=1)
         count = seen.sum(axis=0)
         inside = seen.T @ seen == count[:, None]
@@ -49,8 +49,8 @@ class Slipped(NamedTuple):
 class Became:
     """Outcomes of a window's detections without identities.
 
-    stamps, counts: of M scans [ns], and detections of each. By detection: rows, its index in the
-    message; landmarks, its number in the submap, 0 for none; clutter, whether it is false.
+    stamps, counts: of M scans [ns], and detections of each. By detection: rows, index in the
+    message; landmarks, number in the submap or 0; clutter, whether it is false.
     """
 
     stamps: Int64[np.ndarray, " M"]
@@ -79,13 +79,13 @@ NONE_UNNAMED = Unnamed(np.empty(0, np.uint32), np.empty((0, 0), np.bool_))
 class LocalMap:
     """N(mean, covariance) of (end pose, pose nodes, landmarks) in the frame of its start pose.
 
-    ids: of the L landmarks, strictly ascending. mean: (x [m], y [m], theta [rad]) of the end pose
-    and K pose nodes, then (x₁, y₁, …, x_L, y_L); theta in (−π, π]. covariance: positive definite,
-    [m², m·rad, rad²]. node_stamps: team time of the nodes [ns], strictly ascending. biases,
-    sensitivity: shared errors b of the robot's submaps, ascending, and a row S = ∂mean/∂b of each.
-    curvature: rows D = ∂²mean/∂b², zero but for the clock's: given b the mean is mean + Σ (S b + ½
-    D b²). unnamed: of the landmarks from number 2³¹ on. The start pose is exactly zero: the submap
-    contains no information from outside the window.
+    The start pose is exactly zero: the submap contains no information from outside the window. ids:
+    of the L landmarks, strictly ascending. mean: (x [m], y [m], theta [rad]) of the end pose and K
+    pose nodes, then (x₁, y₁, …, x_L, y_L); theta in (−π, π]. covariance: positive definite, [m²,
+    m·rad, rad²]. node_stamps: team time [ns], strictly ascending. biases, sensitivity: shared
+    errors b of the robot's submaps, ascending, and a row S = ∂mean/∂b of each. curvature: rows D =
+    ∂²mean/∂b², zero but for the clock's: given b the mean is mean + Σ (S b + ½ D b²). unnamed: of
+    the landmarks from number 2³¹ on.
     """
 
     ids: UInt32[np.ndarray, " L"]
@@ -109,12 +109,12 @@ class LocalMap:
 
     @property
     def landmarks(self) -> Float[np.ndarray, "L 2"]:
-        """Landmark positions in the start frame [m]."""
+        """Landmark positions [m] in the start frame."""
         return self.mean[3 + 3 * len(self.node_stamps) :].reshape(-1, 2)
 
     @property
     def spacings(self) -> Float[np.ndarray, "U U"]:
-        """Distances [m] between unnamed landmarks that one keyframe saw; ∞ between others."""
+        """Distances [m] between unnamed landmarks that one keyframe observed; ∞ between others."""
         x, y = self.landmarks[self.ids >= UNNAMED].T
         masks = self.unnamed.seen.astype(np.float32)
         away = core.hypot(x[:, None] - x, y[:, None] - y)
@@ -124,9 +124,8 @@ class LocalMap:
 
     @property
     def distinct(self) -> Bool[np.ndarray, "L L"]:
-        """Pairs of landmarks, by index in `ids`, that cannot be one; none where all are named.
-
-        Two that one keyframe observed, and all pairs with a named landmark.
+        """Pairs of landmarks, by index in `ids`, that cannot be one: two of one keyframe, and all
+        pairs with a named landmark; none where all are named.
         """
         unnamed = self.ids >= UNNAMED
         together = np.full((len(self.ids), len(self.ids)), bool(unnamed.any()))
@@ -141,7 +140,7 @@ class LocalMap:
 
     @property
     def named(self) -> "LocalMap":
-        """The marginal without the unnamed landmarks."""
+        """Marginal without the unnamed landmarks."""
         if not len(self.ids) or self.ids[-1] < UNNAMED:
             return self
         named = int(np.searchsorted(self.ids, UNNAMED))
@@ -151,19 +150,19 @@ class LocalMap:
 
     @property
     def motion(self) -> "LocalMap":
-        """The marginal over the end pose."""
+        """Marginal over the end pose."""
         return LocalMap(self.ids[:0], self.mean[:3], self.covariance[:3, :3])
 
     @property
     def without_biases(self) -> "LocalMap":
-        """The same submap with the shared errors taken as zero."""
+        """The submap with the shared errors at zero."""
         return LocalMap(
             self.ids, self.mean, self.covariance, self.node_stamps, unnamed=self.unnamed
         )
 
     @property
     def without_nodes(self) -> "LocalMap":
-        """The marginal over end pose and landmarks."""
+        """Marginal over end pose and landmarks."""
         if not len(self.node_stamps):
             return self
         behind = 3 + 3 * len(self.node_stamps)

@@ -1,4 +1,4 @@
-"""The condensed factor: old submaps as one quadratic cost over the nodes that remain in the graph.
+"""Old submaps as one quadratic cost over the nodes that remain in the graph.
 
 Linearised at the state `at` of condensing,
 
@@ -26,19 +26,16 @@ Values = Float[np.ndarray, " _"]
 Matrix = Float[np.ndarray, "n n"]
 
 
-HISTORY = 50
-"""Number of condensed submaps of each stream whose costs are stored."""
-PATH_BLOCK = 64
-"""Number of poses in each run of an eliminated path."""
+HISTORY = 50  # number of condensed submaps of each stream whose costs are stored
+PATH_BLOCK = 64  # poses in each run of an eliminated path
 
 
 @dataclass(frozen=True, eq=False)
 class SubmapCosts:
     """Agreement of submaps with the rest of the map, oldest first: χ² should be close to dof.
 
-    streams: of each submap. table: rows χ² without discounts; dof, dim − w tr(JᵀP⁻¹J Σ), its
-    redundancy (Baarda 1968); the robust weight w; the median of χ² with `dof` degrees of freedom,
-    NaN for less than one.
+    table: rows χ² without discounts; dof, dim − w tr(JᵀP⁻¹J Σ), its redundancy (Baarda 1968); the
+    robust weight w; the median of χ² with `dof` degrees of freedom, NaN for less than one.
     """
 
     streams: tuple[Stream, ...] = ()
@@ -46,19 +43,19 @@ class SubmapCosts:
 
     @property
     def chi2(self) -> Values:
-        """χ² of each."""
+        """χ² of each submap."""
         chi2: Values = self.table[0]
         return chi2
 
     @property
     def dof(self) -> Values:
-        """Degrees of freedom of each."""
+        """Degrees of freedom of each submap."""
         dof: Values = self.table[1]
         return dof
 
     @property
     def weight(self) -> Values:
-        """Robust weight of each."""
+        """Robust weight of each submap."""
         weight: Values = self.table[2]
         return weight
 
@@ -71,19 +68,19 @@ class SubmapCosts:
         return {robot: places[robot] for robot in sorted(places)}
 
     def select(self, places: Sequence[int]) -> "SubmapCosts":
-        """Select some, by place."""
+        """Select submaps by place."""
         return SubmapCosts(tuple(self.streams[k] for k in places), self.table[:, places])
 
     def followed_by(self, later: "SubmapCosts") -> "SubmapCosts":
-        """Append later ones."""
+        """Append later submaps."""
         return SubmapCosts(self.streams + later.streams, np.hstack([self.table, later.table]))
 
 
 class EliminatedPath(NamedTuple):
-    """The eliminated poses of a stream, first to last, at the state of their elimination.
+    """Eliminated poses of a stream, first to last, at the state of their elimination.
 
     blocks: runs of PATH_BLOCK poses, the last one shorter, stored once in checkpoints. is_fixed:
-    whether the first pose is a constant.
+    the first pose is a constant.
     """
 
     blocks: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -91,11 +88,11 @@ class EliminatedPath(NamedTuple):
 
     @property
     def poses(self) -> Float[np.ndarray, "K 3"]:
-        """All of them."""
+        """All poses."""
         return np.concatenate([np.zeros((0, 3)), *self.blocks])
 
     def longer(self, poses: Float[np.ndarray, "K 3"]) -> "EliminatedPath":
-        """Append poses to the path."""
+        """Append poses."""
         whole = [each for each in self.blocks if len(each) == PATH_BLOCK]
         rest = np.concatenate([np.zeros((0, 3)), *self.blocks[len(whole) :], poses])
         runs = (rest[k : k + PATH_BLOCK].copy() for k in range(0, len(rest), PATH_BLOCK))
@@ -105,8 +102,8 @@ class EliminatedPath(NamedTuple):
 class Departed(NamedTuple):
     """Statistics of the condensed factors, as of their condensing.
 
-    robots: Σ w χ² and Σ dof of each robot. submaps: the newest costs of each stream, oldest first.
-    believed: number of believed submaps of each landmark. paths: the eliminated poses.
+    robots: Σ w χ² and Σ dof of each robot. submaps: newest costs of each stream, oldest first.
+    believed: number of believed submaps of each landmark.
     """
 
     robots: Mapping[str, tuple[float, float]]
@@ -136,11 +133,11 @@ NOBODY = Departed({}, SubmapCosts(), {}, {})
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """The quadratic cost of the module's equation, over nodes none of which is fixed.
+    """The quadratic cost of the module's equation, over free nodes.
 
-    submaps: number of submaps that it replaces. redundancy: number of measured quantities less
-    eliminated unknowns. resting: ids of the landmarks at rest in the order of their places; None if
-    there have never been any.
+    submaps: number of submaps that it replaces. redundancy: measured quantities less eliminated
+    unknowns. resting: ids of the landmarks at rest in the order of their places; None before the
+    first.
     """
 
     factor: core.Quadratic
@@ -151,7 +148,7 @@ class Condensed:
 
     @property
     def nodes(self) -> Indices:
-        """Its nodes in the graph."""
+        """Nodes of the cost in the graph."""
         return self.factor.nodes
 
     @cached_property
@@ -161,7 +158,7 @@ class Condensed:
         return {id_: k for k, id_ in enumerate(ids)}
 
     def tied(self, sizes: Indices, node_of: Indices, becomes: Mapping[int, int]) -> "Condensed":
-        """Merge landmarks into one node: the same cost where they are equal.
+        """Merge landmarks into one node, with the same cost where they are equal.
 
         sizes: of each node. node_of: new number of each former node. becomes: that of each
         renumbered landmark. The linearisation point is that of the first merged landmark.

@@ -1,13 +1,13 @@
-"""The bounded fold: old submaps become one quadratic, selected by sequence number only.
+"""Bounded fold: old submaps become one quadratic, selected by sequence number only.
 
 The last `lag` submaps of each stream of the main island stay factors. Older ones become one
 quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`). A
-landmark that no raw submap contains comes to rest: given the other nodes it is a Gaussian,
-eliminated like an old pose, until a submap observes it again. So the cost of a tick depends on the
-landmarks near the robots only, not on the duration of the run.
+landmark without a raw submap comes to rest: it is eliminated, as a Gaussian given the other nodes,
+until a submap observes it again. The cost of a tick thus depends on the landmarks near the robots,
+not on the duration of the run.
 
 No submap is condensed before the fold has `begin` submaps, before its robust scale is final, or in
-an unmerged island, whose frame will still be transformed.
+an unmerged island, whose frame will be transformed.
 """
 
 from collections import defaultdict
@@ -36,19 +36,15 @@ from teamslam.team.shapes import Bool, Int64
 Indices = Int64[np.ndarray, " _"]
 
 FIRST = 64
-"""Number of landmarks without a raw submap from which landmarks come to rest: fewer cost less as
-nodes.
-"""
+"""Landmarks without a raw submap from which landmarks come to rest; fewer cost less as nodes."""
 ALL_AWAKE = 2**62
-RUN = 16
-"""Number of submaps whose poses are eliminated together."""
+RUN = 16  # number of submaps whose poses are eliminated together
 
 
 class Limits(NamedTuple):
     """The sizes by which a fold is condensed.
 
-    begin: largest raw fold. lag: submaps of each stream that are never condensed. first: number of
-    landmarks without a raw submap from which landmarks come to rest.
+    begin: largest raw fold. lag: submaps of each stream that stay raw. first: see FIRST.
     """
 
     begin: int = 128
@@ -63,8 +59,8 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     """Condense the old submaps of the fold's main island.
 
     Submaps whose poses cannot be eliminated stay raw. A team with unnamed landmarks, which stay
-    nodes, condenses once it has as many submaps as landmarks. Association keeps observations of
-    condensed submaps (`memory`); landmarks that few submaps confirm are dropped.
+    nodes, condenses once it has as many submaps as landmarks; observations of condensed submaps are
+    stored (`memory`), and landmarks that few submaps confirm are dropped.
     """
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:
@@ -107,8 +103,8 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
 def _extend_memory(
     graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold
 ) -> tuple[Memory, Indices]:
-    """Extend the graph's memory; return also the dropped landmarks: none during an audit, none that
-    an operator has judged.
+    """Extend the graph's memory; return also the landmarks to drop: none during an audit, none
+    judged.
     """
     counts, stays = np.zeros(len(graph.fixed), np.int64), np.zeros(len(graph.fixed), np.bool_)
     before = {} if graph.condensed is None else graph.condensed.departed.believed
@@ -197,10 +193,8 @@ def _condense_island(
 def _find_idle(
     graph: Graph, stays: Bool[np.ndarray, " F"], apart: Collection[int], first: int
 ) -> Indices:
-    """List the nodes of landmarks that come to rest, ascending: in no submap that stays nor in
-    another island (`apart`).
-
-    None while no landmark rests yet and fewer than `first` could.
+    """List the nodes of landmarks that come to rest, ascending: in no raw submap and no other
+    island (`apart`), at least `first` at the first time.
     """
     seen = {*graph.landmark_nodes[np.repeat(stays, np.diff(graph.landmark_start))].tolist()}
     found = sorted(n for id_, n in graph.landmarks.items() if n not in seen and id_ not in apart)

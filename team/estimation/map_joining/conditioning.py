@@ -1,16 +1,13 @@
-"""The Gaussian back end of one robot: its own map, and its pose in the team's map.
+"""Gaussian back end of one robot: its own map, and its pose in the team's map.
 
 The own map joins the submaps one by one into one Gaussian (Brooks & Bailey 2008, "HybridSLAM";
-Williams 2001): the identity of two landmarks is an observation without noise. Earlier submaps are
-not linearised again, so the map is overconfident after many joins.
+Williams 2001); the identity of two landmarks is an observation without noise. Without
+relinearisation the map is overconfident after many joins.
 
 The pose in the team's map is the broadcast prior (joint marginal of the robot's last joined end
-pose and landmarks) times the later submaps, solved at once as the centre does (decision 21). The
-product is exact once the centre's estimates have corrected the shared errors of the robot's
-submaps.
-
-A landmark observation that everything else contradicts (a misread barcode) is left out of this
-solution, which no fused message contains.
+pose and landmarks) times the later submaps, solved as at the centre (decision 21) and exact once
+the centre's estimates have corrected the shared errors of the submaps. A landmark observation that
+everything else contradicts is left out of it; no fused message contains this solution.
 """
 
 import math
@@ -32,15 +29,15 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, UInt32
 
 INDEFINITE, SINGULAR = 1, 2
-"""Faults of the core: the covariance of the innovation of all known landmarks is not positive
-definite, or that of one landmark is singular.
+"""Faults of the core: the covariance of all known landmarks' innovation is not positive definite,
+or that of one landmark is singular.
 """
 
 
 def initial_map(
     pose: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"] | None
 ) -> WholeMap:
-    """Make a map with a pose only; covariance None: exactly known."""
+    """Make a map with a pose only; covariance None: exact."""
     spread = np.zeros((3, 3)) if covariance is None else covariance
     return WholeMap(np.zeros(0, dtype=np.uint32), pose, spread)
 
@@ -64,26 +61,19 @@ def _raise_fault(fault: int) -> None:
 
 
 GATE = 18.420680744107813
-"""99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`.
-
-χ² beyond which a submap's observation of a landmark is attributed to another landmark. Some twenty
-are tested for each pose, and leaving out a correct one costs little.
+"""99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`, beyond which a submap's observation is
+attributed to another landmark. Some twenty are tested for each pose; leaving out a correct one
+costs little.
 """
-MAX_ITERATIONS, STEP_TOLERANCE = 50, 1e-6
-"""End of a solve, by number or largest change [m, rad], as in `JoinSettings`."""
-CONTRADICTED = 1e-6
-"""Probability below which the cost of a prior and submaps counts as a contradiction."""
-FEWEST = 2
-"""Number of rejected landmarks from which a submap as a whole is in doubt; a single one is a
-misread.
-"""
-NO_COVARIANCE = 2
-"""Fault of the core: a map of the chain has no covariance."""
+MAX_ITERATIONS, STEP_TOLERANCE = 50, 1e-6  # end of a solve, by number or largest change [m, rad]
+CONTRADICTED = 1e-6  # probability below which the cost of a prior and submaps is a contradiction
+FEWEST = 2  # number of rejected landmarks from which a submap as a whole is in doubt
+NO_COVARIANCE = 2  # fault of the core: a map of the chain has no covariance
 
 
 class SubmapCorrection(NamedTuple):
-    """The centre's corrections of a robot's submaps: covariance factor f, shared biases b (name,
-    estimate, standard deviation).
+    """Corrections of a robot's submaps: covariance factor f, biases b (name,
+    estimate, deviation).
     """
 
     covariance_factor: float = 1.0
@@ -93,8 +83,8 @@ class SubmapCorrection(NamedTuple):
         """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D, with
         sensitivity S and curvature D.
 
-        The uncertainty of b is taken as independent of the map, which is conservative. A bias
-        without an estimate is zero.
+        The uncertainty of b counts as independent of the map, which is conservative. A bias without
+        an estimate is zero.
         """
         if self.covariance_factor == 1.0 and not local.biases:
             return local
@@ -111,7 +101,7 @@ class SubmapCorrection(NamedTuple):
 
 
 class RobotPrior(NamedTuple):
-    """A robot's last joined end pose and landmarks: the joint covariance of (x, y, θ, x₁, y₁, …).
+    """A robot's last joined end pose and landmarks: joint covariance of (x, y, θ, x₁, y₁, …).
 
     In the island's frame [m, rad], ids ascending; a row of zeros is a known constant. shared:
     corrections of the robot's submaps.
@@ -133,7 +123,7 @@ class Followed(NamedTuple):
     """A robot's map after its later submaps, with their agreement.
 
     known: number of each submap's landmarks in the map or another submap. refused: those that
-    everything else contradicts. cost: χ² in `dof` degrees of freedom, without these. disputed: that
+    everything else contradicts. cost: χ² of `dof` degrees of freedom, without these. disputed: that
     χ² is too large, or most of a submap would be refused.
     """
 
@@ -156,10 +146,9 @@ class Posed(NamedTuple):
 def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     """Join the submaps that follow the map's pose, in order, by least squares.
 
-    With a landmark beyond the gate, the landmarks are discounted as the gate narrows and those
-    beyond it left out. Where that is most of a submap, or the rest is still contradictory, a whole
-    factor is at fault: Cauchy's loss on whole submaps and on the map finds it. Raises
-    NotACovarianceError, NotDeterminedError.
+    With a landmark beyond the gate, the landmarks are discounted as the gate narrows, and those
+    beyond it left out. If that is most of a submap, or the rest is contradictory, Cauchy's loss on
+    whole submaps and on the map finds the fault. Raises NotACovarianceError, NotDeterminedError.
     """
     submaps = [each.without_nodes for each in pending]
     if not submaps:
@@ -200,7 +189,7 @@ def _solve_chain(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolu
 
 
 def is_majority(refused: int, known: int) -> bool:
-    """Whether too many landmarks are refused for a fault in single ones."""
+    """Return whether too many landmarks are refused for a fault in single ones."""
     return refused >= FEWEST and 2 * refused > known
 
 

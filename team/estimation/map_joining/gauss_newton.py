@@ -1,14 +1,11 @@
-"""The solution of a submap graph: Gauss-Newton, with shorter or damped steps where the cost would
-rise.
+"""Solve a submap graph by Gauss-Newton, with shorter or damped steps where the cost would rise.
 
 Minimises Σ ρ(rᵀ(f P)⁻¹r) + Σ ρ(inter-robot measurement) + Σ ‖initial pose − prior‖² + Σ ρ(bias −
 prior) by iterated re-weighting: ρ(χ²) is χ² up to a gate g, and g (2 − g/χ²) beyond, with weight
-(g/χ²)². A new factor's gate is wide and narrows with each iteration: the chain must adapt to a true
-loop closure. The prior of a robot's own bias is Student's t of one degree of freedom, with loss 2
-log(1 + χ²).
-
-Each landmark of a submap also has a gate and a weight, as additional variance of that landmark
-(`core.Estimate`).
+(g/χ²)². A new factor's gate is wide and narrows with each iteration, so that the chain adapts to a
+true loop closure. The prior of a robot's own bias is Student's t of one degree of freedom, with
+loss 2 log(1 + χ²). Each landmark of a submap also has a gate and a weight, as additional variance
+of that landmark (`core.Estimate`).
 """
 
 import math
@@ -31,12 +28,11 @@ from teamslam.team.shapes import Float, Int64
 
 Values = Float[np.ndarray, " _"]
 HALVINGS = 4
-"""Number of times that an undamped step is halved before damping: in the long curved valleys of
-odometry damped steps are very short.
+"""Halvings of an undamped step before damping: in the long curved valleys of odometry damped steps
+are very short.
 """
 MOST_DAMPING = 1e8
-STUCK = math.inf
-"""Damping of a point from which no step lowers the cost."""
+STUCK = math.inf  # damping of a point from which no step lowers the cost
 
 
 def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
@@ -51,7 +47,7 @@ def _powers(base: float, exponents: Int64[np.ndarray, " k"]) -> Float[np.ndarray
 def robust_scale(
     age: Int64[np.ndarray, " k"], start: float, decay: float
 ) -> Float[np.ndarray, " k"]:
-    """Widening of the gates after `age` iterations: max(1, start · decay^age)."""
+    """Return the widening of the gates after `age` iterations: max(1, start · decay^age)."""
     if decay >= 1.0:  # it never narrows
         return np.maximum(1.0, start * _powers(decay, age))
     narrowing = _narrowing(start, decay)
@@ -73,33 +69,30 @@ STILL = 1e-3
 """Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
 tenth of the shift by condensing (docs/decisions/25).
 """
-LANDMARK_GATE = 13.8
-"""χ² of two numbers that a sound landmark exceeds with probability 10⁻³."""
-PLAIN = 1e9
-"""Widening of gates beyond every χ²."""
+LANDMARK_GATE = 13.8  # χ² of two numbers that a sound landmark exceeds with probability 10⁻³
+PLAIN = 1e9  # widening of gates beyond every χ²
 LIKELY = 0.999
-"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a minimum
-unlikely.
+"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a
+minimum unlikely.
 """
 SUSPICIOUS = 1.3
-"""Factor by which a suspicious cost also exceeds its degrees of freedom: submaps are only nearly
-Gaussian.
+"""Factor by which a suspicious cost also exceeds its degrees of freedom, since submaps are only
+nearly Gaussian.
 """
-FULL_AGE = 1_000_000
-"""Number of iterations after which every robust scale has reached its final value."""
+FULL_AGE = 1_000_000  # iterations after which every robust scale is final
 
 
 @dataclass(frozen=True)
 class JoinSettings:
     """Settings of map joining; docs/scenario.md describes those of a scenario.
 
-    robust: whether factors beyond their gates are discounted. The gates of χ² are wider by
-    robust_start² at first, and by robust_decay² less with each iteration, down to 1. submap_gate:
-    factor on the gate of a submap. landmark_gate: χ² of two numbers from which a submap's landmark
-    is discounted. max_iterations, step_tolerance: end of a full solve, by number or largest change
-    [m, rad]. alignment_confidence, alignment_heading_sigma: for a merge of islands, quantile of the
-    χ² test and largest `Alignment.heading_sigma` [rad]. bias_sigma: scale of Student's t prior on
-    each error of a robot's submaps. common_bias_sigma: standard deviation of those that all robots
+    robust: factors beyond their gates are discounted. The gates of χ² are wider by robust_start² at
+    first, and by robust_decay² less with each iteration, down to 1. submap_gate: factor on a
+    submap's gate. landmark_gate: χ² of two numbers from which a submap's landmark is discounted.
+    max_iterations, step_tolerance: end of a full solve, by number or largest change [m, rad].
+    alignment_confidence, alignment_heading_sigma: for a merge of islands, quantile of the χ² test
+    and largest `Alignment.heading_sigma` [rad]. bias_sigma: scale of Student's t prior on each
+    error of a robot's submaps. common_bias_sigma: standard deviation of those that all robots
     share; "marker": share of the range. joined_ranges: see `core.SubmapFactor.at_joined_ranges`.
     landmark_sigma: standard deviation [m] of the measured point about the landmark's place: part of
     a map's covariance, not of the weights.
@@ -124,7 +117,7 @@ class JoinSettings:
 
 
 def ages(count: int) -> Int64[np.ndarray, " count"]:
-    """Ages of new factors: 0."""
+    """Make the ages of new factors: 0."""
     return np.zeros(count, dtype=np.int64)
 
 
@@ -178,7 +171,7 @@ class Island:
 
     @property
     def cost(self) -> float:
-        """The minimised cost."""
+        """Cost at this state."""
         return self.estimate.cost
 
     @cached_property
@@ -189,7 +182,7 @@ class Island:
 
     @contextmanager
     def determined(self) -> Iterator[None]:
-        """Raise NotDeterminedError that names the node of an unfactorable matrix."""
+        """Raise NotDeterminedError, with the node, for a matrix that has no factor."""
         try:
             yield
         except core.NotPositiveDefiniteError as error:
@@ -211,7 +204,7 @@ class Island:
 
 
 def age_factors(island: Island, iterations: int | None) -> Island:
-    """Add iterations to the age of every factor; None: begin anew."""
+    """Add iterations to the age of every factor; None: reset to 0."""
     if iterations is None:
         age, sighting_age = np.zeros_like(island.age), np.zeros_like(island.sighting_age)
     else:
@@ -240,7 +233,7 @@ def add_sightings(
 
 
 def degrees_of_freedom(island: Island) -> int:
-    """Number of measured quantities less the number of unknowns."""
+    """Count the measured quantities less the unknowns."""
     graph = island.graph
     priors = sum(prior.rank for prior in graph.priors)
     measured = int(graph.dimensions.sum()) + 2 * len(graph.sightings) + priors
@@ -249,21 +242,19 @@ def degrees_of_freedom(island: Island) -> int:
 
 
 def is_suspicious(island: Island, cost: float) -> bool:
-    """Whether the cost is far above its degrees of freedom."""
+    """Return whether the cost is far above its degrees of freedom."""
     dof = degrees_of_freedom(island)
     return dof > 0 and cost > max(SUSPICIOUS * dof, likely_limit(dof))
 
 
 @lru_cache(maxsize=4096)
 def likely_limit(dof: int) -> float:
-    """Quantile of χ² above which a cost is suspicious."""
+    """Return the quantile of χ² above which a cost is suspicious."""
     return chi2_limit(dof, 1.0 - LIKELY)
 
 
 def is_solvable(island: Island) -> bool:
-    """Whether the numbers are finite and every unknown determined, whatever the units
-    (`core.Cholesky`).
-    """
+    """Return whether the numbers are finite and every unknown determined (`core.Cholesky`)."""
     try:
         with np.errstate(all="ignore"):
             _, cost = island.posterior, island.cost
@@ -276,7 +267,7 @@ def iterate_tick(island: Island) -> Island:
     """Apply the iterations of one tick.
 
     With condensed submaps, later ones shorter than STILL are omitted: condensing displaces the map
-    by more.
+    more.
     """
     damping = 0.0
     bounded = island.graph.condensed is not None
@@ -288,7 +279,6 @@ def iterate_tick(island: Island) -> Island:
 
 
 def _stands_still(island: Island) -> bool:
-    """Whether a full step is shorter than STILL, bounded by gᵀA⁻¹g."""
     with island.determined():
         return island.estimate.squared_length <= STILL * len(island.graph.submaps)
 
@@ -296,9 +286,9 @@ def _stands_still(island: Island) -> bool:
 def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
     """Take one step: return the island, the next damping, and the full step's largest change.
 
-    The step −(A + damping · diag A)⁻¹g is taken if it lowers the cost; else, if undamped, a share
-    of it; else a more damped one. Where none helps the state stays and the next damping is STUCK,
-    from which a step begins undamped.
+    The step −(A + damping · diag A)⁻¹g is applied if it lowers the cost; else, if undamped, a share
+    of it; else a more damped one. If none does, the state stays and the next damping is STUCK, from
+    which a step begins undamped.
     """
     with island.determined():
         state, damping, change = island.estimate.take_step(
@@ -313,8 +303,8 @@ def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
 def solve_island(island: Island) -> tuple[Island, int, float]:
     """Solve in full; return also the number of iterations and the last change [m, rad].
 
-    Least squares first: it is the robust solution where no factor is beyond its gate. Else the
-    gates narrow anew. A solve ends when converged, after `max_iterations`, or where no step lowers
+    Least squares first, which is the robust solution without factors beyond their gates; otherwise
+    the gates narrow anew. A solve ends when converged, after `max_iterations`, or if no step lowers
     the cost.
     """
     if island.settings.robust:
@@ -351,7 +341,7 @@ def _descend(island: Island) -> tuple[Island, int, float]:
 def solve_with_fixed(
     island: Island, unknown: int, by: float, iterations: int, *, shortest: float = 0.0
 ) -> Island:
-    """Move one number of the state by `by` and solve for all others given that.
+    """Move one number of the state by `by` and solve for all others.
 
     With p = −A⁻¹g and q = A⁻¹w of the unit vector w, an iteration is p + λ q whose component along
     w is the remaining displacement, until (p + λ q)ᵀ A (p + λ q) is below `shortest`.

@@ -93,10 +93,8 @@ __all__ = [
     "solve_fold",
 ]
 
-NAMED = 10
-"""Most robots named in the record of a merge."""
-PATIENCE = 1.1
-"""Growth of the number of submaps after which a failed search is repeated."""
+NAMED = 10  # most robots named in the record of a merge
+PATIENCE = 1.1  # growth in submaps after which a failed search is repeated
 
 
 class NotCanonicalError(ValueError):
@@ -137,8 +135,8 @@ class LateStartError(ValueError):
 class Tick:
     """The contents of one tick, in canonical order.
 
-    sightings: the inter-robot measurements from the submaps' poses. starts: initial poses of the
-    streams that begin here. outside: reason for each submap refused in advance; set_aside: other
+    sightings: inter-robot measurements from the submaps' poses. starts: initial poses of the
+    streams that begin. outside: reason for each submap refused in advance; set_aside: other
     refusals. verdicts: an operator's, on landmarks of submaps up to here.
     """
 
@@ -171,9 +169,8 @@ class Fold:
     failed search for a lower minimum. iterations, change: of the main island's last full solution
     [m, rad]. refused: submaps not in the map, with the reason (`refusal`); motion_only: those with
     their motion in the map; left_out: inter-robot measurements without a solution; set_aside: other
-    refusals. landmarks: the sets of unnamed landmarks, with the evidence. audits: closures that may
-    be undone (`auditing`). cuts: seams that cut a stream into parts, each a stream here
-    (`continuity`).
+    refusals. audits: closures that may be undone (`auditing`). cuts: seams that cut a stream into
+    parts (`continuity`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -210,7 +207,7 @@ class Fold:
 
     @property
     def has_maps(self) -> bool:
-        """Whether it has a saved map, a survey or the station of fixes."""
+        """Whether the fold has a saved map, a survey or the station of fixes."""
         return any(is_map(stream) for stream in self.home)
 
     @property
@@ -220,8 +217,8 @@ class Fold:
 
     @cached_property
     def main_key(self) -> Stream | None:
-        """Key of the island with a known initial pose and a robot, else with a saved map and a
-        robot, else with the smallest stream, of a robot if possible.
+        """Key of the main island: with a known initial pose and a robot, else with a saved map and
+        a robot, else with the smallest stream, of a robot if possible.
         """
         robots = sorted(stream for stream in self.home if not is_map(stream))
         placed = {self.home[robot] for robot in robots}
@@ -232,7 +229,7 @@ class Fold:
 
     @property
     def main(self) -> Island:
-        """The island of the team's map. Raises KeyError before the first submap."""
+        """Island of the team's map. Raises KeyError before the first submap."""
         if self.main_key is None:
             raise KeyError("no submap has come yet")
         return self.islands[self.main_key]
@@ -241,8 +238,8 @@ class Fold:
     def frame(self) -> Stream | None:
         """The stream whose start fixes the main island's frame.
 
-        One with a known initial pose (all are given in one frame), else one with a saved map, else
-        any; of several the smallest. That of a saved map with a known start is the survey's.
+        The smallest with a known initial pose (all are in one frame), else with a saved map, else
+        any; the survey's for a saved map with a known start.
         """
         if self.main_key is None:
             return None
@@ -255,7 +252,7 @@ class Fold:
         return self.islands[self.home[(robot, incarnation)]]
 
     def next_sequence(self, stream: Stream) -> int:
-        """Sequence number of a stream's next submap."""
+        """Return the sequence number of a stream's next submap."""
         if stream not in self.home:
             return first_of(stream)
         return self.islands[self.home[stream]].graph.next_sequence(stream)
@@ -281,8 +278,7 @@ def fold_submaps(
     settings: JoinSettings,
     sightings: Sequence[InterRobotFactor] = (),
 ) -> Fold:
-    """Fold one tick: add the submaps, place new landmarks, iterate, and merge islands where
-    possible.
+    """Fold one tick: add the submaps, place new landmarks, iterate, and merge islands if possible.
 
     contributions: in canonical order, after all folded ones; else raises NotCanonicalError or
     GapError. sightings: from these submaps, each a factor once both of its nodes are in one island.
@@ -332,10 +328,7 @@ def fold_submaps(
 
 
 def compact_fold(fold: Fold) -> Fold:
-    """Drop the values of a fold that can be computed again, for a checkpoint.
-
-    The submaps are shared with other folds; the state and the graph's nodes and factors remain.
-    """
+    """Drop the values of a fold that can be computed again, for a checkpoint."""
     islands = {
         key: replace(island, graph=replace(island.graph)) for key, island in fold.islands.items()
     }
@@ -387,7 +380,7 @@ def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold
 def separate_moved(fold: Fold, chance: float, newest: Sequence[Contribution] | None = None) -> Fold:
     """Separate the landmarks that have moved since a saved map from their former places.
 
-    The worst first, with a solution before the next test. newest: the submaps whose landmarks are
+    The worst first, with a solution before the next test. newest: submaps whose landmarks are
     tested; None: all.
     """
     islands = dict(fold.islands)
@@ -441,10 +434,7 @@ def _check_order(fold: Fold, contributions: Sequence[Contribution]) -> None:
 
 
 def _merge_all(fold: Fold, at_last: bool = False) -> Fold:
-    """Merge islands while possible.
-
-    A pair whose merge failed is tried again when it has grown by PATIENCE, or `at_last`.
-    """
+    """Merge islands while possible; retry a failed pair when grown by PATIENCE, or `at_last`."""
     main_key = fold.main_key
     keys = sorted(fold.islands, key=lambda key: precedence(fold, key))
     reasons: dict[Stream, str] = {}
@@ -471,8 +461,8 @@ def _merge_all(fold: Fold, at_last: bool = False) -> Fold:
 
 
 def precedence(fold: Fold, key: Stream) -> tuple[bool, bool, bool, Stream]:
-    """Order of islands by whose frame stays in a merge: known initial poses, a saved map, the main
-    one, the smallest.
+    """Order islands by whose frame stays in a merge: with known initial poses, with a saved map,
+    the main one, the smallest.
     """
     streams = fold.islands[key].graph.streams
     started, saved = any(s in fold.starts for s in streams), any(map(is_map, streams))
@@ -505,7 +495,6 @@ def merge_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> F
 
 
 def _search_suspicious(fold: Fold) -> Fold:
-    """Search islands of suspicious cost for a lower minimum, when grown by PATIENCE."""
     islands, searched_at = dict(fold.islands), dict(fold.searched_at)
     for key, island in fold.islands.items():
         size = len(island.graph.submaps)

@@ -1,7 +1,4 @@
-"""Marginals of a joined map, and the agreement of its submaps.
-
-In the frame of an island: the main one, or that of a stream.
-"""
+"""Marginals of a joined map, and the agreement of its submaps, in the frame of an island."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -29,17 +26,13 @@ from teamslam.team.estimation.map_joining.landmark_view import (
 from teamslam.team.estimation.map_joining.submap_graph import Graph
 from teamslam.team.shapes import Bool, Float, UInt32
 
-BELIEVED = 0.5
-"""Least weight of a landmark in a submap for the submap to be believed about it."""
+BELIEVED = 0.5  # least weight of a landmark in a submap for the submap to be believed about it
 
-STEP = 0.1
-"""Step of a derivative along a bias, in its standard deviations."""
+STEP = 0.1  # step of a derivative along a bias, in its standard deviations
 FAR_TOO_SMALL = 3.0
 """Covariance scale from which the robust loss distorts it: at 4 by a few per cent, at 25 by 1.7."""
-ALL = slice(None)
-"""Every submap."""
-MOST_CORRELATED = 0.97
-"""Largest correlation of a submap's error with that of the next one."""
+ALL = slice(None)  # every submap
+MOST_CORRELATED = 0.97  # largest correlation of a submap's error with that of the next one
 
 
 class LandmarkMap(NamedTuple):
@@ -51,7 +44,7 @@ class LandmarkMap(NamedTuple):
 
 
 class LandmarkBlocks(NamedTuple):
-    """Landmarks by ascending id: means [m] and each one's own covariance [m²]."""
+    """Landmarks by ascending id: means [m], each with its own covariance [m²]."""
 
     ids: UInt32[np.ndarray, " L"]
     means: Float[np.ndarray, "L 2"]
@@ -68,8 +61,8 @@ class Trajectory(NamedTuple):
 class EndPoses(NamedTuple):
     """End poses of a stream's submaps, each with its covariance.
 
-    start: of the first submap. crosses: covariance of each pose with the one before it, at first
-    the start.
+    start: of the first submap. crosses: covariance of each pose with the previous one, first the
+    start.
     """
 
     poses: Float[np.ndarray, "K 3"]
@@ -112,7 +105,7 @@ class Agreement(NamedTuple):
 
 
 def bias_estimates(fold: Fold) -> list[BiasEstimate]:
-    """Estimate each stream's shared errors (the robot's own plus the team's), in its island."""
+    """Estimate each stream's shared errors (the robot's plus the team's), in its island."""
     return sorted(each for island in fold.islands.values() for each in _biases_in(island))
 
 
@@ -149,8 +142,8 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
 
 
 class Scatter(NamedTuple):
-    """Standard deviation of a shared error by the submaps' scatter, and the freedom of
-    its square.
+    """Standard deviation of a shared error by the submaps' scatter, and the freedom
+    of its square.
     """
 
     sigma: float
@@ -204,11 +197,11 @@ def scatter_of_series(chains: Sequence[Float[np.ndarray, " _"]]) -> Scatter:
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
-    """List the main island's landmarks in at least `submaps` believed submaps; unnamed ones in the
-    larger of `submaps` and `unnamed`. Those of a saved map are confirmed.
+    """List the main island's landmarks in at least `submaps` believed submaps, and those of a saved
+    map.
 
-    Submaps with a landmark's weight below BELIEVED do not count: contradictory observations do not
-    confirm each other.
+    Unnamed ones need the larger of `submaps` and `unnamed`. Submaps with a landmark's weight below
+    BELIEVED do not count: contradictory observations do not confirm each other.
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
@@ -233,7 +226,7 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
 
 
 def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
-    """Return landmarks of the main island with joint covariance, `landmark_sigma` included."""
+    """Return landmarks of the main island with joint covariance, including `landmark_sigma`."""
     chosen = known(fold.main) if ids is None else sorted(ids)
     mean, covariance = joint(fold.main, [], chosen)
     covariance = covariance + fold.main.settings.landmark_sigma**2 * np.eye(len(covariance))
@@ -241,7 +234,7 @@ def landmark_map(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkMap:
 
 
 def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlocks:
-    """Return landmarks of the main island with separate covariances, `landmark_sigma` included."""
+    """Return landmarks of the main island with separate covariances, including `landmark_sigma`."""
     island = fold.main
     own = island.settings.landmark_sigma**2 * np.eye(2)
     chosen = known(island) if ids is None else sorted(ids)
@@ -259,7 +252,7 @@ def prior_for(
 
 
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
-    """End pose of the stream's last submap, in its island's frame."""
+    """Return the end pose of the stream's last submap, in its island's frame."""
     island = fold.islands[fold.home[stream]]
     return _mean(island, island.graph.streams[stream][-1])
 
@@ -273,7 +266,7 @@ def main_priors(
     """Make the priors (`prior_for`) of streams of the main island.
 
     chosen: landmarks by ascending id; None: all. most: largest number in a prior, those nearest to
-    its pose. The others are new to the robot: its pose is less accurate, and as consistent.
+    its pose. Without the others the robot's pose is less accurate, and as consistent.
     """
     island = fold.main
     ids = np.array(known(island) if chosen is None else chosen)
@@ -327,7 +320,7 @@ def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
 
 
 class Terms(NamedTuple):
-    """The agreement of each factor: submaps, then priors, then inter-robot measurements.
+    """Agreement of each factor: submaps, then priors, then inter-robot measurements.
 
     submaps: without discounts. robots: of each factor. counted: rows w χ² and dof of the joint
     cost.
@@ -398,9 +391,7 @@ def _robots_of_priors(graph: Graph) -> list[str]:
 
 
 def scale_of(costs: SubmapCosts, of: Sequence[int] | slice = ALL) -> Scale | None:
-    """Estimate the covariance scale of some submaps, by place; None with too few degrees of
-    freedom.
-    """
+    """Estimate the covariance scale of some submaps; None with too few degrees of freedom."""
     chi2, dof, _, medians = costs.table[:, of]
     return covariance_scale(chi2, dof, medians)
 
@@ -432,7 +423,7 @@ def _widened(island: Island, factor: float) -> Island:
 
 def widen_covariances(fold: Fold, factor: float) -> Fold:
     """Solve the main island with the submaps' covariances times a factor; unchanged without a
-    solution, or where fixes may be at fault.
+    solution, or with fixes, which may be at fault.
     """
     if factor == 1.0 or fold.main_key is None:
         return fold

@@ -1,8 +1,7 @@
 """The factor graph of one frame: poses, landmarks, biases; submaps, inter-robot measurements,
 priors.
 
-A `Graph` is the structure, independent of the state. An added node's value is composed from the
-nodes already in the graph.
+A `Graph` is the structure, independent of the state.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,22 +41,22 @@ Values = Float[np.ndarray, " _"]
 CommonBias = Bias | Literal["marker"]
 """Errors that the team has in common: of all sensors, or of each landmark's marker."""
 CommonError = Bias | int
-"""A common error: a bias of all sensors, or, by a landmark's number, the share of the range by
-which all robots measure that landmark too far.
+"""A bias of all sensors, or, by a landmark's number, the share of the range by which all robots
+measure that landmark too far.
 """
 SharedError = CommonError | RobotBias
-"""An error of a submap: a bias of its robot or of all sensors, an error of a marker, or in a saved
-map the error of one robot on the days of the map.
+"""An error of a submap: a bias of its robot or of all sensors, of a marker, or in a saved map of
+one robot on the days of the map.
 """
 DRIFT: Mapping[Bias, float] = MappingProxyType(
     {"forward_scale": 0.2, "range_offset": 0.1, "range_scale": 0.1}
 )
 """Scale of a robot's bias on another day about that of a saved map, in scales of its prior.
 
-Errors of ranges come from the sensor's optics and electronics, which age over months; errors of the
-driven distance from tyres, load and floor. Clock offsets and bearings are not carried over: a clock
-is set anew with each start of its computer, and a sensor that is mounted again turns by up to 0.3°,
-more than the prior's scale. The loss is that of Student's t, so a replaced sensor loses the tie.
+Errors of ranges come from optics and electronics, which age over months; errors of the driven
+distance from tyres, load and floor. Clock offsets and bearings are not carried over: a clock is set
+at each start of its computer, and remounting turns a sensor by up to 0.3°, more than the prior's
+scale. The loss is that of Student's t, so a replaced sensor loses the tie.
 """
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
@@ -66,7 +65,7 @@ NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
 class Prior(NamedTuple):
     """A pose (x, y, theta), or biases jointly, ~ N(mean, information⁻¹).
 
-    rank: of the information, singular as of a difference of biases. is_of_robot: one robot's bias,
+    rank: of the information, singular for a difference of biases. is_of_robot: one robot's bias,
     with the loss of Student's t.
     """
 
@@ -78,7 +77,7 @@ class Prior(NamedTuple):
 
     @property
     def is_of_pose(self) -> bool:
-        """Whether it is of a pose."""
+        """Whether the prior is of a pose."""
         return len(self.mean) > len(self.nodes)
 
     @classmethod
@@ -92,8 +91,8 @@ class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, landmarks by id, biases; its factor.
 
     biases: the error of each row of `sensitivity`, the team's last. sensitivity: ∂mean/∂b: a
-    robot's own error and the team's add up. A marker's row is that of the ranges' scale, restricted
-    to its landmark.
+    robot's own error and the team's add up. A marker's row is that of the ranges' scale, for its
+    landmark alone.
     """
 
     contribution: Contribution
@@ -137,7 +136,7 @@ class Joined(NamedTuple):
 
     @property
     def landmarks(self) -> Indices:
-        """The nodes of the submap's landmarks, in its order."""
+        """Nodes of the submap's landmarks, in its order."""
         local = self.contribution.local
         first = 2 + len(local.node_stamps)
         return self.nodes[first : first + len(local.ids)]
@@ -189,9 +188,8 @@ class Graph:
     submaps, or all streams, share; remembered: of each error of a robot on the days of a saved map.
     offset: index in the state of each node's first number, and its length. fixed: exactly known
     initial poses, the gauge. condensed: the quadratic that replaces older submaps (`condensing`);
-    gone: sequence behind a stream's submaps in it, at which `streams` begins. former: the node of a
-    moved landmark's old place, by (saved map, id). memory: observations of condensed submaps for
-    data association.
+    gone: first sequence after them, at which `streams` begins. former: node of a moved landmark's
+    old place, by (saved map, id). memory: observations of condensed submaps.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -221,7 +219,7 @@ class Graph:
 
     @cached_property
     def factors(self) -> core.SubmapGraph:
-        """The factors."""
+        """Factors in the core's form."""
         return core.SubmapGraph(
             self.offset,
             self.fixed,
@@ -248,7 +246,7 @@ class Graph:
 
     @cached_property
     def landmark_nodes(self) -> Indices:
-        """The nodes of the landmarks of all submaps."""
+        """Nodes of the landmarks of all submaps."""
         return np.concatenate([np.zeros(0, np.int64), *(each.landmarks for each in self.submaps)])
 
     @cached_property
@@ -263,11 +261,11 @@ class Graph:
         return headings
 
     def next_sequence(self, stream: Stream) -> int:
-        """Sequence number of a stream's next submap."""
+        """Return the sequence number of a stream's next submap."""
         return self.first_sequence(stream) + len(self.streams[stream]) - 1
 
     def first_sequence(self, stream: Stream) -> int:
-        """Sequence number of a stream's first raw submap."""
+        """Return the sequence number of a stream's first raw submap."""
         return self.gone.get(stream, first_of(stream))
 
     @property
@@ -277,7 +275,7 @@ class Graph:
 
     @property
     def unknowns(self) -> int:
-        """Numbers to be estimated."""
+        """Number of estimated quantities."""
         return int(np.diff(self.offset)[~self.fixed].sum())
 
     def name(self, node: int) -> str:
@@ -331,7 +329,7 @@ def _starts(lengths: Sequence[int]) -> Indices:
 
 
 class _Growth:
-    """The nodes being added to a graph, inside `add_submaps` only."""
+    """Nodes being added by `add_submaps`."""
 
     def __init__(self, graph: Graph, state: Values) -> None:
         self.streams = dict(graph.streams)
@@ -372,8 +370,8 @@ def add_submaps(
 
     A new end pose or pose node is start ∘ local pose; the first submap that observes a landmark
     places it. A stream without an initial pose is fixed at (0, 0, 0), the gauge of its frame. A
-    bias has scale bias_sigma about 0 (without one the submap is taken without biases), a common
-    error is N(0, common_bias_sigma²). numbers: the team's, of unnamed landmarks.
+    bias has scale bias_sigma about 0 (without one the submap's biases are dropped), a common error
+    is N(0, common_bias_sigma²). numbers: the team's, of unnamed landmarks.
     """
     growth = _Growth(graph, state)
     priors = list(graph.priors)
@@ -448,8 +446,8 @@ def _add_errors(
 def _remember(
     growth: _Growth, contribution: Contribution, bias_sigma: Mapping[Bias, float]
 ) -> tuple[list[int], list[Prior]]:
-    """Add the nodes of the errors of single robots in a saved map; return them with their priors
-    and the map's likelihood of them.
+    """Add the nodes of single robots' errors in a saved map; return them, their priors and
+    likelihood.
     """
     own, stream = contribution.own, contribution.stream
     nodes = [growth.add(mean[None], fixed=False) for mean in own.mean]
@@ -467,10 +465,9 @@ def _remember(
 
 
 def _tie_biases(graph: Graph) -> Graph:
-    """Tie each robot's biases to those of its name in a saved map, by name the first.
+    """Tie each robot's biases to those of its name in the first saved map by name.
 
-    b = b₁ + d with the drift d since then of scale DRIFT, Student's t like the prior, which it
-    replaces: b₁ has that prior.
+    b = b₁ + d with the drift d of scale DRIFT, Student's t like the prior, which b₁ has instead.
     """
     if not graph.remembered:
         return graph
@@ -526,7 +523,7 @@ def remove_nodes(
     sightings: Bool[np.ndarray, " S"],
     priors: Bool[np.ndarray, " _"],
 ) -> Graph:
-    """Remove eliminated poses (a stream's first) and landmarks; keep the marked factors, but no
+    """Remove eliminated poses (a stream's first) and landmarks; keep the marked factors, no
     condensed one.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
@@ -551,7 +548,7 @@ def remove_nodes(
 
 
 def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
-    """Renumber the nodes of a graph but for condensed factors.
+    """Renumber the nodes of a graph, except in condensed factors.
 
     node_of: new number of each node. stays: origins of the new nodes, ascending.
     """
@@ -596,7 +593,7 @@ def add_former_place(
     """Separate a landmark's place in a saved map from its present one.
 
     The map's factor gets a node at `value`; with no other observation (not `shared`) it keeps the
-    node, which is no present landmark any more.
+    node, and there is no present landmark.
     """
     node = graph.landmarks[id_]
     if not shared:
@@ -647,8 +644,7 @@ def merge_graphs(
     other_state: Values,
     main_from_other: Float[np.ndarray, "3"],
 ) -> tuple[Graph, Values]:
-    """Join both graphs in the main frame; landmarks with equal ids become one, at the main graph's
-    value.
+    """Join both graphs in the main frame; equal ids become one landmark, at the main graph's value.
 
     The other frame's gauge becomes free, so none of its submaps may be condensed.
     """
