@@ -1,9 +1,10 @@
 """Names and texts for display."""
 
-import json
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import PurePath
+
+import msgspec
 
 OUTSIDE = "not in the team's frame"
 """Replaces the error of poses outside the team map's frame."""
@@ -26,8 +27,8 @@ def data_set_name(path: str | PurePath) -> str:
 def data_set_of(scenario: str) -> str:
     """Data set's name in a scenario's JSON text, or empty."""
     try:
-        return data_set_name(json.loads(scenario)["world"]["path"])
-    except (ValueError, LookupError, TypeError):
+        return data_set_name(msgspec.json.decode(scenario)["world"]["path"])
+    except (msgspec.MsgspecError, UnicodeEncodeError, LookupError, TypeError):
         return ""
 
 

@@ -178,7 +178,7 @@ def _normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | Non
         return None
     value = float(np.exp(np.mean(scales)))
     spread = float(np.std(scales, ddof=1)) if len(scales) > 1 else float(sigmas[0])
-    return Figure("_normal_scale", value, value * spread / np.sqrt(len(scales)), "")
+    return Figure("normal_scale", value, value * spread / np.sqrt(len(scales)), "")
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[_Disagreement]:

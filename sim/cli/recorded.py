@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import click
 
@@ -19,9 +19,6 @@ from teamslam.sim.cli.commands import (
     refuse,
 )
 from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
-
-if TYPE_CHECKING:
-    pass
 
 PICTURES = "Pictures for a paper or a talk"
 app = Group()

@@ -1,5 +1,7 @@
+import pytest
+
 from teamslam.central.desk.evaluation.events import EventDetector
-from teamslam.central.desk.names import without_decimals
+from teamslam.central.desk.names import data_set_of, without_decimals
 from teamslam.team.wire import messages as m
 from tests import build
 from tests.support import fused_map
@@ -94,3 +96,18 @@ def test_the_end_of_the_world_and_its_notes_are_told_once():
         ("done", "final map of 0 landmarks"),
         ("joined", "recorder joined"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "name"),
+    [
+        ('{"world": {"path": "data/mine.zip"}}', "mine"),
+        ('{"world": {"path": "\\ud800"}}', ""),
+        ('{"world": {"path": 5}}', ""),
+        ('{"world": []}', ""),
+        ("\ud800", ""),
+        ("{", ""),
+    ],
+)
+def test_a_data_set_is_named_where_the_scenario_is_readable(scenario, name):
+    assert data_set_of(scenario) == name

@@ -6,7 +6,14 @@ import pytest
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.tick_fold import join_settings
-from teamslam.sim.calibration.consistency import covariance_factor, disagreements, landmark_sigma
+from teamslam.sim.calibration.consistency import (
+    central_figures,
+    covariance_factor,
+    disagreements,
+    landmark_sigma,
+)
+from teamslam.sim.calibration.figures import Figure
+from teamslam.sim.scenarios.scenario import load
 from teamslam.team.estimation.map_joining.joining import (
     Fold,
     JoinSettings,
@@ -49,6 +56,13 @@ def test_the_factor_makes_up_for_covariances_that_are_too_small():
     factor = covariance_factor(folds_of(range(12), 0.4), CentralConfig())
     assert factor.value == pytest.approx(2.5, rel=0.2)
     assert 0.0 < factor.sigma < 0.4
+
+
+def test_figures_of_the_team_are_named_as_the_centres_fields():
+    stray = Figure("bias_sigma.range_scale", 0.01, 0.001, "")
+    found = central_figures(folds_of(range(12), 0.4), load("thesis"), [stray], lambda _: None)
+    assert [each.name for each in found] == [stray.name, "covariance_factor", "normal_scale"]
+    assert found[-1].value == pytest.approx(1.0, abs=0.3)
 
 
 def test_how_far_all_robots_see_landmarks_from_their_survey_is_learnt_by_the_truth():
