@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from teamslam.team.recording.reader import Log
-from teamslam.team.wire.arrays import floats, ids, octets, stamps
+from teamslam.team.wire.arrays import derivatives, floats, ids, octets, stamps
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError
-from teamslam.team.wire.messages import Digest, Message, tag_of
+from teamslam.team.wire.messages import Digest, Message, Submap, tag_of
 
 HEAD = ("key", "counter", "wall_ns")
 LATEST_NS = 2**63 - 1
@@ -31,7 +31,7 @@ _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
     **dict.fromkeys(("stamps", "nodes"), stamps),
     **dict.fromkeys(("seen", "pairs", "certificate", "signature", "sha256"), octets),
 }
-"""Decoder of a field's bytes by name; other fields are floats."""
+"""Decoder of a field's bytes by name; other fields are floats, but for a submap's derivatives."""
 
 
 @dataclass
@@ -48,8 +48,12 @@ def table_of(channel: Channel, message: Message) -> str:
     return channel.name if kind is channel.message else tag_of(kind).partition("/")[0]
 
 
-def numbers_of(name: str, value: bytes) -> NDArray[Any]:
+def numbers_of(message: Message, name: str) -> NDArray[Any]:
     """Return the numbers in a field's bytes."""
+    value: bytes = getattr(message, name)
+    if isinstance(message, Submap) and name in ("sensitivity", "curvature"):
+        rows = len(message.biases) if name == "sensitivity" else bool(value)
+        return derivatives(value, rows * len(message.mean) // 8, name)
     return _ARRAYS.get(name, floats)(value, name)
 
 
@@ -147,8 +151,7 @@ def export_tables(
             if path not in tables:
                 tables[path] = files.enter_context(closing(form(path, type(message))))
             values = [
-                _value(each.name, each.type, getattr(message, each.name))
-                for each in msgspec.structs.fields(message)
+                _value(message, each.name, each.type) for each in msgspec.structs.fields(message)
             ]
             head = (sample.key, sample.counter, min(sample.wall_ns, LATEST_NS))
             tables[path].add((*head, *values), len(sample.payload))
@@ -159,17 +162,17 @@ def export_tables(
 def _arrow_type(pa: Any, name: str, kind: object) -> Any:
     of = getattr(kind, "__origin__", kind)
     if of is bytes and kind != Digest:
-        return pa.list_(pa.from_numpy_dtype(numbers_of(name, b"").dtype))
+        return pa.list_(pa.from_numpy_dtype(_ARRAYS.get(name, floats)(b"", name).dtype))
     scalars = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
     return scalars.get(of, pa.string()) if isinstance(of, type) else pa.string()
 
 
-def _value(name: str, kind: object, value: object) -> object:
-    match value:
+def _value(message: Message, name: str, kind: object) -> object:
+    match value := getattr(message, name):
         case bytes() if kind == Digest:
             return value.hex()
         case bytes():
-            return numbers_of(name, value)
+            return numbers_of(message, name)
         case tuple() | dict() | msgspec.Struct():
             return json.dumps(msgspec.to_builtins(value))
         case _:

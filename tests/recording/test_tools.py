@@ -22,7 +22,7 @@ from teamslam.team.recording.summary import summarise_log
 from teamslam.team.recording.tables import export_tables, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
+from teamslam.team.wire.arrays import from_derivatives, from_floats, from_ids
 from teamslam.team.wire.bus import NO_COUNTER, Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -371,6 +371,23 @@ def test_numbers_read_back_from_csv_are_the_same(tmp_path_factory, seen):
     for name in ("ranges", "bearings"):
         back = np.array([float(word) for word in row[name].split()])
         assert from_floats(back) == getattr(message, name)
+
+
+@pytest.mark.parametrize("write", [from_derivatives, from_floats], ids=["float32", "float64"])
+def test_a_submaps_derivatives_are_exported_at_the_width_that_they_have(write, tmp_path):
+    sensitivity, curvature = np.arange(14) / 8.0, np.arange(7) / 4.0
+    message = msgspec.structs.replace(
+        submap(0),
+        biases=("bearing", "clock_offset"),
+        sensitivity=write(sensitivity),
+        curvature=write(curvature),
+    )
+    export_tables(
+        recorded(tmp_path / "log.mcap", [sampled(c.SUBMAP, "alpha", message)]), tmp_path / "out"
+    )
+    (row,) = rows_of(tmp_path / "out" / "submap.csv")
+    assert [float(word) for word in row["sensitivity"].split()] == sensitivity.tolist()
+    assert [float(word) for word in row["curvature"].split()] == curvature.tolist()
 
 
 def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path):

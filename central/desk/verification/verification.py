@@ -57,7 +57,8 @@ def _first_difference(recorded: m.Message, recomputed: m.Message, *, exact: bool
         if a == b:
             continue
         if name in arrays:
-            found = _array_difference(name, numbers_of(name, a), numbers_of(name, b), exact=exact)
+            one, other = numbers_of(recorded, name), numbers_of(recomputed, name)
+            found = _array_difference(name, one, other, exact=exact)
             if found is not None:
                 return found
         elif exact or not _close(a, b):

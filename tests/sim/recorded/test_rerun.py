@@ -17,7 +17,7 @@ from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, from_floats
+from teamslam.team.wire.arrays import derivatives, floats, from_derivatives, from_floats
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -120,6 +120,21 @@ def test_a_flipped_bit_of_one_odometry_measurement_is_traced_to_its_submap(sampl
     assert counts(result)["submap"] == (12, 11), "no other submap depends on that measurement"
     for name in ("fused_map", "prior", "final_map", "trajectory"):
         assert counts(result)[name][0] == counts(result)[name][1], "maps follow from submaps"
+
+
+def test_a_tampered_derivative_of_a_submap_is_named(samples, tmp_path):
+    victim = messages(samples, ch.SUBMAP, "r2")[1]
+    count = len(victim.biases) * len(victim.mean) // 8
+    other = derivatives(victim.sensitivity, count, "sensitivity")
+    other[5] += 1.0
+    tampered = msgspec.structs.replace(victim, sensitivity=from_derivatives(other))
+    log = written(
+        tmp_path / "log.mcap",
+        changed(samples, ch.SUBMAP, lambda each: tampered if each == victim else each),
+    )
+    first = verify(log).first
+    assert (first.key, first.field) == ("robot/r2/submap", "sensitivity[5]")
+    assert float(first.recorded) == pytest.approx(float(first.recomputed) + 1.0)
 
 
 def test_a_tampered_map_is_the_only_one_that_differs(samples, tmp_path):
