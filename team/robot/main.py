@@ -306,5 +306,5 @@ def _beginning(sample: Sample, robot: str) -> int | None:
     try:
         start = decoded(sample.payload, m.InitialPose)
     except WireError:
-        return None  # the door counts it
+        return None  # the shell counts it
     return start.incarnation if start.number == 0 else None

@@ -3,7 +3,7 @@
     bounds → Hybrid-SLAM → ledger → submap → own map → poses
     check    estimate      account   publish
 
-Law 1: what is published for fusion depends on the robot's own measurements alone. The team's map
+Law 1: messages for fusion depend on the robot's own measurements alone. The team's map
 serves `team/pose` only.
 """
 

@@ -117,7 +117,7 @@ class RobotNode:
         self.final: m.FusedMap | None = None
         self.withheld = 0
 
-    # What the shell asks.
+    # Queries of the shell.
 
     @property
     def ledger(self) -> Ledger:
@@ -356,7 +356,7 @@ class RobotNode:
     def _leave_incarnation(self) -> None:
         if not self.account.consumed:
             return
-        if self.done:  # the driver had ended, and has come back: its last word is not the last
+        if self.done:  # the driver has returned after its end
             self.done = self._has_sent_done = False
             self.account.ended.append(self.statement())
             return

@@ -275,7 +275,7 @@ class EndOfStream:
         """Process a world's end; one without this robot ends its stream here."""
         self._world_end = end = merge_ends(end, self._world_end)
         mine = [stream for stream in end.streams if stream.robot == self._robot]
-        if self.at_source is not None:  # no other word counts any more
+        if self.at_source is not None:  # the only authority from here on
             incarnation, count = self.at_source
             self._last = m.StreamEnd(robot=self._robot, incarnation=incarnation, measurements=count)
             return

@@ -56,7 +56,7 @@ class Submaps(Sequence[LocalMap]):
     def __init__(self, robot: str, exchange: Exchange) -> None:
         self.buffers = exchange == "rendezvous"
         self._robot = robot
-        self._greeted: set[str] = set()  # told of an encounter since the last window ended
+        self._greeted: set[str] = set()  # with an announced encounter since the last window
         self._streams: dict[int, _Stream] = {}
         self._newest, self._incarnation = _Stream(), 0
         self.sent = 0

@@ -10,7 +10,7 @@ Wheels are scikit-build-core's. An editable install builds into the source tree 
 folder to the path, which holds a link to the package `teamslam` and nothing else: no import hook
 stands before a second checkout on PYTHONPATH, and no other folder of the tree can be imported.
 
-Without a C++20 compiler on the machine the build takes the one of the `ziglang` wheel.
+Without a C++20 compiler on the machine the build uses that of the `ziglang` wheel.
 """
 
 import argparse

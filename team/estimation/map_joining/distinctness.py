@@ -142,10 +142,10 @@ LEAST_TIED = 2  # least number of landmarks on either side of a place that odome
 
 
 class OdometryTie(NamedTuple):
-    """A place in a stream that no landmark spans: none is both behind it and elsewhere.
+    """A place in a stream that no landmark spans: none is both after it and elsewhere.
 
-    first: submap behind it. earlier, later: numbers of landmarks. begin_ns, end_ns: of the part
-    behind it. sigmas: of its start's position [m] and heading [rad].
+    first: submap after it. earlier, later: numbers of landmarks. begin_ns, end_ns: of the part
+    after it. sigmas: of its start's position [m] and heading [rad].
     """
 
     stream: Stream

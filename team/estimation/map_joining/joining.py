@@ -342,7 +342,7 @@ def solve_fold(fold: Fold, settings: JoinSettings) -> Fold:
     """
     if fold.main_key is None:
         return fold
-    with np.errstate(all="ignore"):  # what overflows has no finite cost, and is not taken
+    with np.errstate(all="ignore"):  # an overflow has no finite cost, and is not accepted
         return _solve_islands(fold, settings, fold.main_key)
 
 

@@ -36,7 +36,7 @@ AMBIGUOUS = 1.0  # difference of evidence below which neighbouring seams are one
 LEAST_COUNT = 4  # least measurements of a landmark: fewer may be clutter
 MOST_TRACKED = 1  # most landmarks that a robot observes on both sides of a seam, by chance
 MOST_COMMON = 2
-"""Most landmarks on both sides of a seam, by chance: three place a stream. More of those behind it
+"""Most landmarks on both sides of a seam, by chance: three place a stream. More of those after it
 must be new and each side must miss one beyond doubt, since a narrow camera misses many but maps
 none twice.
 """
@@ -47,7 +47,7 @@ Misses = Float[np.ndarray, "K n"]
 
 
 class _Place(NamedTuple):
-    """A candidate: rows of the submaps before and behind a seam in a stream, and its evidence."""
+    """A candidate: rows of the submaps before and after a seam in a stream, and its evidence."""
 
     before: int
     after: int
