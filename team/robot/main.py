@@ -106,9 +106,8 @@ class RobotShell:
             self._log_due_s = time.monotonic() + self._log_look_s
 
     def _complete_log(self) -> bool:
-        """Request what the robot's log lost from the source; return whether there was any.
-
-        The log also records the answers to the robot's own requests.
+        """Request what the robot's log lost, with answers to its own requests; return whether any
+        was lost.
         """
         lost = False
         tap: Tap | None = getattr(self.bus, "tap", None)
@@ -147,7 +146,7 @@ class RobotShell:
         self.bus.watch_alive(driver)
 
     def _await_recorder(self) -> None:
-        """Run until the recorder has every submap, since it has no other source."""
+        """Run until the recorder has every submap; it has no other source."""
         recorded: dict[int, int] = {}
 
         def take(samples: Sequence[Sample]) -> None:
@@ -222,8 +221,8 @@ class RobotShell:
                 return
 
     def _believed(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Drop the ends and initial poses that the source does not confirm, since a new incarnation
-        ends the previous one. Without a source (a replayed log) the message alone counts.
+        """Drop ends and initial poses that the source does not confirm; without a source (a
+        replayed log) the message alone counts.
         """
         passed = []
         for sample in samples:
@@ -256,9 +255,7 @@ class RobotShell:
         return passed
 
     def _is_doubted(self, sample: Sample) -> bool:
-        """Return whether a sample is an announced end, which the source must confirm: without keys
-        any node may announce one.
-        """
+        """Return whether a sample is an announced end; without keys any node may announce one."""
         if sample.key != ch.END.key():
             return False
         try:
@@ -271,9 +268,6 @@ class RobotShell:
         return True
 
     def _ask_about_ends(self) -> None:
-        """Confirm announced ends at the source; without a source (a replayed log) the message
-        counts.
-        """
         self._ends_due_s = time.monotonic() + CONFIRMED_S
         doubted, self._doubted = self._doubted, {}
         for (incarnation, count), sample in doubted.items():
@@ -295,7 +289,6 @@ class RobotShell:
         return any(self.bus.is_alive(n) for n in ("world", ch.source_node(self.node.robot)))
 
     def _beginning_at_source(self) -> m.InitialPose | None:
-        """Request the initial pose of the stream's current incarnation."""
         starts = [x for x in self._ask_source(0, 0, 0) or () if isinstance(x, m.InitialPose)]
         return max(starts, key=lambda start: start.incarnation, default=None)
 

@@ -184,7 +184,6 @@ class Mapper:
         return False
 
     def _drive(self, measurement: m.AnyOdometry) -> int:
-        """Check and integrate an odometry interval; return as `core.Segmenter.drive`."""
         end_ns = measurement.stamp_ns + self._offset_ns
         if not self.note_time(end_ns, end_ns):
             return BY_CORE.index(Rejection.TIME)
@@ -195,9 +194,8 @@ class Mapper:
         return drive(translate.interval_of(measurement, self.config))
 
     def _observe(self, measurement: m.Measurement) -> Rejection | None:
-        """Add a scan or an initial pose, or return the reason to reject it.
-
-        A scan precedes the odometry of its stamp, which may end a window.
+        """Add a scan or an initial pose; a scan precedes the odometry of its stamp, which may end a
+        window.
         """
         stamp_ns = measurement.stamp_ns
         is_near = self.note_time(stamp_ns, stamp_ns - 1)
@@ -245,7 +243,7 @@ class Mapper:
     ) -> None:
         """Publish a submap before anything can raise, then join it.
 
-        measurement: the one that closed the window; None: the stream's end.
+        measurement: closed the window; None: the stream's end.
         """
         writer = self.writer
         if closed.became is not None:

@@ -86,7 +86,6 @@ class RunningPoses:
         return [] if prior.ids and prior.frame == self._claimed else self._withdrawn_pose()
 
     def _withdrawn_pose(self) -> list[Outgoing]:
-        """Return the own pose for team/pose, if the last one is not in the prior's frame."""
         prior = self._prior
         if prior is None:
             return []
@@ -111,9 +110,7 @@ class RunningPoses:
         return prior if prior is not None and prior.incarnation == incarnation else None
 
     def _placing(self, incarnation: int) -> m.Prior | None:
-        """Return the newest prior if it places this incarnation, by a pose or by
-        landmarks alone.
-        """
+        """Return the newest prior if it places this incarnation by a pose or by landmarks."""
         prior = self._prior
         if prior is None or prior.incarnation != incarnation:
             return None

@@ -131,7 +131,6 @@ class Inbox:
             self._forget(following)
 
     def _forget(self, incarnation: int) -> None:
-        """Drop measurements that cannot follow this incarnation."""
         self._received = 0
         self._of_source.clear()
         self.later = {e: measurements for e, measurements in self.later.items() if e > incarnation}

@@ -39,7 +39,6 @@ class _Stream:
         return message
 
     def between(self, first: int, end: int) -> Iterator[bytes]:
-        """Yield the factors, then the submaps, in [first, end)."""
         for sequence in sorted(self.factors):
             if first <= sequence < end:
                 yield from self.factors[sequence]
@@ -138,7 +137,6 @@ class Submaps(Sequence[LocalMap]):
         return [*self._answer(requested)] if requested.robot == self._robot else []
 
     def _answer(self, request: m.SubmapsRequest) -> Iterator[bytes]:
-        """Yield each incarnation's initial pose, then factors and submaps by sequence."""
         every = request.incarnation == 0
         for incarnation in sorted(self._streams) if every else [request.incarnation]:
             stream = self._streams.get(incarnation, _Stream())

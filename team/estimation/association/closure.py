@@ -118,9 +118,8 @@ def align(
     *,
     is_own: bool = False,
 ) -> list[Placement]:
-    """Find the alignments of a patch with a target, by decreasing evidence.
-
-    Those of fewer votes than least / WEAK are neither closures of `least` pairs nor rivals.
+    """Find the alignments of a patch with a target, by decreasing evidence, without those of fewer
+    votes than least / WEAK.
     """
     tolerance, reach = TOLERANCE * profile.same, REACH * profile.same
     votes = propose_alignments(patch.points, target.points, tolerance, reach, patch.parts)
@@ -253,10 +252,11 @@ def _count_missing(
 def combine_maps(
     patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
 ) -> tuple[Joint, Side]:
-    """Combine two maps in the target's frame; return the joint map and the target's part in it.
+    """Combine two maps in the target's frame; return the joint map and the target's part near the
+    patch.
 
     The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
-    map's extent. Only the target's landmarks near the patch are included.
+    map's extent.
     """
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
@@ -404,7 +404,6 @@ def search_other_island(
 
 
 def _saved_share(mine: IslandView, theirs: IslandView, found: Closure) -> float:
-    """Compute the matched share of the overlap between a saved map and the whole other island."""
     first, second = np.array([(pair.first, pair.second) for pair in found.pairs]).T
     sides = [
         (mine, apply_motion(found.motion, mine.joint.mean), first),

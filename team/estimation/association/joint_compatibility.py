@@ -186,9 +186,6 @@ def _grow(
     profile: AssociationProfile,
     limits: tuple[float, float],
 ) -> MergedPairs:
-    """Merge candidates one by one; limits: largest standard deviations before and after SURE_AFTER
-    pairs.
-    """
     (*merged,), joint = begun
     first, second = candidates
     while len(first):
@@ -304,7 +301,6 @@ def _select_partners(
 def _extend(
     one: _Assignment, first: int, others: Indices, profile: AssociationProfile, most_sd: float
 ) -> list[_Assignment]:
-    """Extend an assignment by one landmark: unmatched, and with each partner that fits."""
     found = [one]
     others = others[~one.joint.apart[first, others]]
     if not len(others):

@@ -25,7 +25,7 @@ SETTLED = 1e-4  # largest entry [m, rad] of a last step: it changes no associati
 class SmoothedWindow:
     """Gaussian of K poses and L landmarks in the window's frame; errors of poses on their right.
 
-    covariance: of (ξ₁ … ξ_K, landmarks). squared: the cost at the minimum, with `dof` degrees.
+    covariance: of (ξ₁ … ξ_K, landmarks). squared: the cost, with `dof` degrees of freedom.
     """
 
     poses: Float[np.ndarray, "K 3"]

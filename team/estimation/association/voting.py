@@ -98,7 +98,6 @@ def propose_alignments(
 
 
 def _keep_distinct(found: list[Vote], points: int) -> list[Vote]:
-    """Sort votes by decreasing number of matched points; drop variants of votes with more."""
     found.sort(key=lambda vote: (-len(vote.first), *vote.motion.tolist()))
     distinct: list[Vote] = []
     paired = np.full((len(found), points), -1)

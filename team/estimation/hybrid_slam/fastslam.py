@@ -116,8 +116,8 @@ def propagated_and_updated(
 ) -> tuple[Particles, StepInfo]:
     """Resample if the particles are thin, move them, then update them by the measurements.
 
-    Resampling, below an effective sample size of `resample_below`·M, comes first, so the last step
-    of a window keeps its weights. ranges [m] and bearings [rad] are calibrated; own: their
+    Resampling, below an effective sample size of `resample_below`·M, comes first, so a window's
+    last step keeps its weights. ranges [m] and bearings [rad] are calibrated; own: their
     covariances (`teamslam.team.estimation.scans`); an id may occur twice. Draws M × 3 normal
     numbers, and one uniform one if it resamples. Raises NotACovarianceError.
     """

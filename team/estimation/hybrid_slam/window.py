@@ -30,8 +30,8 @@ STILL = np.zeros(4)
 class Innovation(NamedTuple):
     """Σ νᵀ S⁻¹ ν (NIS) of predicted measurements, χ² of `dof` degrees of freedom, two for each.
 
-    A consistency check without ground truth (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2).
-    Both add up over keyframes, whose innovations are independent if the models are right.
+    A consistency check without ground truth (Bar-Shalom, Li and Kirubarajan 2001, section 5.4.2);
+    both add up over keyframes, independent if the models are right.
     """
 
     squared: float
@@ -180,11 +180,11 @@ def advance(
 def gaussian(window: Window) -> LocalMap:
     """Make one Gaussian of the window so far: (end pose, pose nodes, landmarks by ascending id).
 
-    Each landmark of each particle is solved again given the path. With w and (poses, landmarks) of
-    each particle, μ = Σ wᵢ μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ =
-    μᵢ − μ (Xu, eq. 4.5-4.6), the means and deviations of poses on SE(2), plus POSE_JITTER. Poses
-    and landmarks are the base's, in the frame of its start. The window's smoother gives derivatives
-    by the biases, with the precision of a message. Raises NotACovarianceError.
+    With w and (poses, landmarks) of each particle, the latter solved again given the path, μ = Σ wᵢ
+    μᵢ and P = Σ wᵢ (Pᵢ + dᵢ dᵢᵀ), where Pᵢ = blkdiag(0, Σ₁, …, Σ_L), dᵢ = μᵢ − μ (Xu, eq. 4.5-4.6),
+    the means and deviations of poses on SE(2), plus POSE_JITTER. Poses and landmarks are the
+    base's, in the frame of its start. The window's smoother gives derivatives by the biases, with
+    the precision of a message. Raises NotACovarianceError.
     """
     ids, mean, covariance, fault = window.core.close()
     _raise_fault(fault, "the submap of a window")

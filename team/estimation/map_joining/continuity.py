@@ -83,7 +83,6 @@ def find_seam(
 
 
 def _compare_inside(island: Island, submap: Joined) -> float:
-    """Return the greatest evidence at a scan SCANS or more from the submap's ends."""
     scans = _count_scans(submap)
     found = [0.0]
     for k in range(SCANS, scans - SCANS + 1):

@@ -312,7 +312,6 @@ def _find_in_stream(
 def _align_beyond_chance(
     own: Float[np.ndarray, "n 2"], others: Float[np.ndarray, "N 2"], same: float
 ) -> tuple[Vote, float] | None:
-    """Align the points with others at the radius [m] of least E; return both."""
     if min(len(own), len(others)) < LEAST_PAIRS:
         return None
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))

@@ -190,7 +190,6 @@ def _decide(
     kind: str,
     sides: tuple[Stream, Stream],
 ) -> Decision:
-    """Decide on a closure; one that failed or was undone before "waits"."""
     why = found.why
     if not why and fold.landmarks.was_undone(pairs):
         why = "it was undone before"

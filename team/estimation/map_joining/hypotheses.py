@@ -120,7 +120,7 @@ def sights_of(island: Island, beyond: float = -math.inf) -> dict[int, Sights]:
 
 
 class _Two(NamedTuple):
-    """The observations at the second place, and the scan's evidence."""
+    """Observations at the second place, and the scan's evidence."""
 
     second: Bool[np.ndarray, " n"]
     evidence: float
@@ -152,7 +152,6 @@ def median(values: Float[np.ndarray, "..."]) -> Values:
 
 
 def _least_side(n: int) -> int:
-    """Return the fewest of n observations at a place; fewer may be misread."""
     return max(LEAST_SIDE, math.ceil(STRAY * n))
 
 
@@ -323,8 +322,8 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
     """Solve the hypotheses of a jump beside a submap that disagrees with the rest.
 
-    Leaving out the submap is solved first, since a jump removes no more cost. A jump before a first
-    submap is an error of the initial pose.
+    Leaving out the submap comes first, since a jump removes no more cost. Before a first submap a
+    jump is an error of the initial pose.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps

@@ -177,7 +177,6 @@ def _uncertainty_of(
 def _best_place(
     sights: _Sights, stream: Stream, misses: Misses, possible: Bool[np.ndarray, "n n"]
 ) -> list[_Place]:
-    """Find the candidate of most evidence in a stream, with neighbours within AMBIGUOUS."""
     rows = _rows_of(sights, stream)
     places = list(_list_places(sights, rows, misses, possible))
     if not places:

@@ -75,7 +75,7 @@ def _list_numbers(submap: Joined, number: dict[int, int]) -> list[int]:
 def _add_rows(
     submap: Joined, errors: list[int], nodes: Mapping[CommonError, int], number: dict[int, int]
 ) -> Joined:
-    """Add each marker's row of sensitivity: that of the range's scale, for the landmark alone."""
+    """Add each marker's row of sensitivity: the range scale's, for the landmark alone."""
     if not errors:
         return submap
     local = submap.contribution.local

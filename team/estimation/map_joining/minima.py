@@ -148,7 +148,6 @@ def _mirror_streams(island: Island) -> Iterator[Island]:
 
 
 def _list_passages(island: Island, stream: Stream) -> list[tuple[int, int]]:
-    """List pairs of landmarks, by index in the state, observed in succession."""
     graph, before = island.graph, set[int]()
     pairs: set[tuple[int, int]] = set()
     for submap in graph.submaps:

@@ -126,7 +126,6 @@ def _raw(
     paths: Mapping[Stream, EliminatedPath],
     numbers: Mapping[Key, Sequence[int]],
 ) -> Island:
-    """Build the graph of all submaps, at the state of the island or of condensing."""
     graph, settings = island.graph, island.settings
     full, state = add_submaps(
         EMPTY_GRAPH,

@@ -157,7 +157,6 @@ def _sensitivity(local: LocalMap, biases: Sequence[CommonError]) -> Float[np.nda
 def _curvature(
     local: LocalMap, biases: Sequence[SharedError], sensitivity: Float[np.ndarray, "B _"]
 ) -> Float[np.ndarray, "B _"]:
-    """∂²mean/∂b² of each bias; zero of common errors."""
     rows = np.zeros_like(sensitivity)
     for at, error in enumerate(biases):
         if isinstance(error, str) and biases.count(error) == 1:
@@ -446,9 +445,6 @@ def _add_errors(
 def _remember(
     growth: _Growth, contribution: Contribution, bias_sigma: Mapping[Bias, float]
 ) -> tuple[list[int], list[Prior]]:
-    """Add the nodes of single robots' errors in a saved map; return them, their priors and
-    likelihood.
-    """
     own, stream = contribution.own, contribution.stream
     nodes = [growth.add(mean[None], fixed=False) for mean in own.mean]
     growth.remembered |= {
