@@ -13,7 +13,7 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 OVERLOOKED = 0.4
 """Upper bound of the probability that a window which observes a landmark misses one beside it."""
-WELL_KNOWN = 4  # least submaps of a landmark that shows the misses of those beside it
+WELL_KNOWN = 4  # submaps from which a landmark reveals the misses of those beside it
 LEAST_OVERLOOKED = 0.1
 """Lower bound of the same probability: some landmarks are visible from one side only."""
 

@@ -18,7 +18,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.shapes import Bool, Float
 
-BINS = 8  # number of distances at which the probability of an observation is learnt
+BINS = 8  # bins of distance in which the probability of an observation is estimated
 REACH = 0.95  # share of today's observations that are nearer than the farthest distance
 STEPS = 4  # points between two poses of a path
 

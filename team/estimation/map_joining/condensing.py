@@ -36,7 +36,9 @@ from teamslam.team.shapes import Bool, Int64
 Indices = Int64[np.ndarray, " _"]
 
 FIRST = 64
-"""Landmarks without a raw submap from which landmarks come to rest; fewer cost less as nodes."""
+"""Number of landmarks without a raw submap at which they begin to come to rest; fewer cost less as
+nodes.
+"""
 ALL_AWAKE = 2**62
 RUN = 16  # number of submaps whose poses are eliminated together
 

@@ -22,7 +22,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marg
 from teamslam.team.estimation.map_joining.submap_graph import Joined
 from teamslam.team.shapes import Bool, Float, Int64
 
-SCANS = 3  # scans with detections of a side
+SCANS = 3  # scans with detections on a side
 LEAST_SCANS = 2 * SCANS  # least scans of a submap, so that the last ones are beside its end
 LEAST_COUNT = 2  # least measurements of a landmark: single ones may be clutter
 ABSENT, PRESENT = 1.5, 2.0

@@ -54,7 +54,7 @@ def find_weakly_placed(island: Island, ids: Collection[int]) -> list[int]:
 
 WELL_OBSERVED = 4
 """Least submaps of a landmark whose residuals count in the scale of right associations."""
-LEAST_RESIDUALS = 30  # least number of these residuals for an estimate of the scale
+LEAST_RESIDUALS = 30  # least number of residuals for an estimate of their scale
 LEAST_SCALE = 0.1  # least scale of residuals: data without noise have none
 
 

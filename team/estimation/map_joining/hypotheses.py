@@ -49,7 +49,7 @@ MOVED: Final = "landmark_moved"
 SHARED: Final = "identity_shared"
 CARRIED_OFF: Final = "carried_off"
 LEAST_SPOILT = 3  # least number of submaps spoilt by one identity of two landmarks
-SPOILT = 0.6  # least share of them among the submaps that have a landmark elsewhere
+SPOILT = 0.6  # least share of spoilt submaps among those with a landmark elsewhere
 FAR = 50.0  # bound of an observation's χ² in a scan, so that an outlier does not decide it
 STRAY = 0.1
 """Least share of a landmark's observations at a second place, unless they agree with each other: of

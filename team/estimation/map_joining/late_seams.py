@@ -36,9 +36,9 @@ AMBIGUOUS = 1.0  # difference of evidence below which neighbouring seams are one
 LEAST_COUNT = 4  # least measurements of a landmark: fewer may be clutter
 MOST_TRACKED = 1  # most landmarks that a robot observes on both sides of a seam, by chance
 MOST_COMMON = 2
-"""Most landmarks on both sides of a seam, by chance: three place a stream. More of those after it
-must be new and each side must miss one beyond doubt, since a narrow camera misses many but maps
-none twice.
+"""Most landmarks on both sides of a seam, by chance: three place a stream. More than these must be
+new after it, and each side must miss one beyond doubt: a narrow camera misses many but maps none
+twice.
 """
 NODES = ((0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0), (-math.sqrt(3.0), 1.0 / 6.0))
 """Nodes and weights of the Gauss-Hermite rule of three points."""
