@@ -120,9 +120,13 @@ class TeamConfig(msgspec.Struct, frozen=True, kw_only=True):
     centre: bool = True
 
 
+UNREADABLE = msgspec.MsgspecError, UnicodeEncodeError, RecursionError
+"""Errors of decoding a configuration in JSON that another process has written."""
+
+
 def team_config(text: str) -> TeamConfig:
     """Decode a resolved scenario in JSON; raises ValueError."""
     try:
         return msgspec.json.decode(text, type=TeamConfig)
-    except (msgspec.MsgspecError, UnicodeEncodeError) as error:
+    except UNREADABLE as error:
         raise ValueError(f"not a team's configuration in JSON: {error}") from None

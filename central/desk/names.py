@@ -6,6 +6,8 @@ from pathlib import PurePath
 
 import msgspec
 
+from teamslam.central.config import UNREADABLE
+
 OUTSIDE = "not in the team's frame"
 """Replaces the error of poses outside the team map's frame."""
 _DIGITS = re.compile("([0-9]+)")
@@ -28,7 +30,7 @@ def data_set_of(scenario: str) -> str:
     """Data set's name in a scenario's JSON text, or empty."""
     try:
         return data_set_name(msgspec.json.decode(scenario)["world"]["path"])
-    except (msgspec.MsgspecError, UnicodeEncodeError, LookupError, TypeError):
+    except (*UNREADABLE, LookupError, TypeError):
         return ""
 
 

@@ -122,10 +122,10 @@ def report(
     from teamslam.team.recording.reader import open_log
 
     output = output or _folder_of(log)
-    opt.check_folder(output)
     width_in = _width(width, look)
     steps = Steps()
     opened = replace(open_log(log), reading=steps.share)
+    opt.check_folder(output)
     steps.begin("scoring the run")
     evaluation = add_holes(evaluate(opened.samples()), opened)
     run = read_run(opened, evaluation, steps, proves_ledger=ledger)

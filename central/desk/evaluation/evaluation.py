@@ -10,7 +10,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
-from teamslam.central.config import TeamConfig, team_config
+from teamslam.central.config import UNREADABLE, TeamConfig, team_config
 from teamslam.central.desk.evaluation.association import association_result
 from teamslam.central.desk.evaluation.clocks import (
     Late,
@@ -162,7 +162,7 @@ def _examine_streams(
 def _config(log: Collected, robot: str) -> RobotConfig:
     announced = log.newest(ch.ROBOT_CONFIG, m.Configuration, robot)
     if announced is not None:
-        with suppress(msgspec.MsgspecError):
+        with suppress(*UNREADABLE):
             text = with_current_names(msgspec.json.decode(announced.configuration))
             return msgspec.convert(text, RobotConfig)
     return RobotConfig(robot)

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from teamslam.central.config import UNREADABLE
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import RerunError, index_log
@@ -71,7 +72,8 @@ def _answers_of(log: Log) -> Iterator[Answer]:
         channel, name, message = sound
         if channel is ch.ROBOT_CONFIG and isinstance(message, m.Configuration):
             robot = robots.setdefault(name, _Robot(name))
-            robot.config = msgspec.json.decode(message.configuration, type=RobotConfig)
+            with suppress(*UNREADABLE):
+                robot.config = msgspec.json.decode(message.configuration, type=RobotConfig)
         elif channel is ch.ODOMETRY and isinstance(message, m.AnyOdometry):
             yield from robots.setdefault(name, _Robot(name)).drive(message)
         elif channel in (ch.TEAM_POSE, ch.TRAJECTORY, ch.TEAM_TRAJECTORY):

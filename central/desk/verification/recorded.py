@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import msgspec
 
-from teamslam.central.config import CentralConfig
+from teamslam.central.config import UNREADABLE, CentralConfig
 from teamslam.central.desk.names import in_order
 from teamslam.team.config import RobotConfig
 from teamslam.team.former_names import with_current_names
@@ -199,7 +199,7 @@ class Recorded:
         try:
             text = with_current_names(msgspec.json.decode(announced.configuration))
             return msgspec.convert(text, kind), announced.digest
-        except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        except UNREADABLE as error:
             raise RerunError(f"{subject} is not one of this version: {error}") from None
 
 

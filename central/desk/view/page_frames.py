@@ -18,8 +18,10 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 
+from teamslam.central.config import UNREADABLE
 from teamslam.central.desk.drawing import ROBOT_COLOURS
 from teamslam.central.desk.evaluation.association import members_of
 from teamslam.central.desk.evaluation.errors import transform_points
@@ -56,11 +58,23 @@ def title_of(team: str, metadata: Mapping[str, str], name: str) -> str:
     if data_set := data_set_of(text):
         return f"{data_set} · {name}"
     try:
-        scenario = str(json.loads(text)["name"])
-    except (ValueError, LookupError, TypeError):
+        scenario = str(msgspec.json.decode(text)["name"])
+    except (*UNREADABLE, LookupError, TypeError):
         scenario = team
     seed = f", seed {metadata['seed']}" if "seed" in metadata else ""
     return f"{scenario}{seed} · {name}"
+
+
+class _Sensor(msgspec.Struct, frozen=True):
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    max_range: float | None = None
+    field_of_view: float | None = None
+
+
+class _Robot(msgspec.Struct, frozen=True):
+    """The part of a robot's configuration that the page draws."""
+
+    sensor: _Sensor = _Sensor()
 
 
 @dataclass
@@ -232,12 +246,14 @@ class PageFrames:
         stream.errors.take_truth(message)
 
     def _take_sensor(self, message: m.Configuration) -> None:
-        sensor = json.loads(message.configuration).get("sensor", {})
+        try:
+            sensor = msgspec.json.decode(message.configuration, type=_Robot).sensor
+        except UNREADABLE:
+            return
         robot = message.node.removeprefix("robot/")
-        mount = sensor.get("mount", (0.0, 0.0, 0.0))
-        self._streams[robot].mount = np.array(mount)
-        within = {"range": sensor.get("max_range"), "view": sensor.get("field_of_view")}
-        self._add_frame("sensor", r=robot, mount=mount, **within)
+        self._streams[robot].mount = np.array(sensor.mount)
+        within = {"range": sensor.max_range, "view": sensor.field_of_view}
+        self._add_frame("sensor", r=robot, mount=sensor.mount, **within)
 
     def _take_measurements(
         self, message: m.Observations | m.Points | m.Detections | m.Sightings

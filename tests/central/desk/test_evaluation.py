@@ -344,3 +344,13 @@ def test_a_map_far_from_all_true_landmarks_has_no_errors_and_says_within_which_g
         f"can not be computed: nearest neighbour within {run.map.matching.gate_m:.3g} m, "
         "0 of 8 matched"
     )
+
+
+@pytest.mark.parametrize("text", ["x", '{"a": ' + 100_000 * "[" + 100_000 * "]" + "}"])
+def test_a_run_whose_configurations_are_not_readable_has_no_scenario(text):
+    log = joined_log(scenario(), 0.1)
+    for channel in (ch.WORLD_CONFIG, ch.ROBOT_CONFIG):
+        log = changed(log, channel, lambda each: replace(each, configuration=text))
+    run = evaluate(log)
+    assert (run.scenario, run.data_set) == (None, "")
+    assert run.map is not None

@@ -594,3 +594,22 @@ def test_the_layout_names_only_topics_that_there_are(kept):
     optional = {f"team/crowd/view/particles/r{i}" for i in (1, 2, 3)}
     assert named - optional <= there
     assert {"team/crowd/view/map", "team/crowd/view/robot/r3", "team/crowd/view/log"} <= named
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x",
+        "[]",
+        '{"sensor": 5}',
+        '{"sensor": {"mount": "abc"}}',
+        '{"sensor": {"mount": [1, 2]}}',
+        '{"a": ' + 100_000 * "[" + 100_000 * "]" + "}",
+    ],
+)
+def test_a_robots_configuration_that_is_not_one_leaves_its_measurements_unmounted(text):
+    config = build.configuration(node="robot/r1", configuration=text)
+    seen = build.observations(stamp_ns=5, robot="r1", ids=[1], ranges=[2.0], bearings=[0.0])
+    told = told_of((ch.ROBOT_CONFIG, config), (ch.OBSERVATIONS, seen))
+    assert not [each for each in told if each["k"] == "sensor"]
+    assert [each["v"] for each in told if each["k"] == "see"] == [[1, 2.0, 0.0]]
