@@ -115,11 +115,11 @@ class CentralShell:
         self._shell.end(final)
 
     def _restore(self) -> None:
-        if self._stored.members and self._shell.going:
+        members, self._stored.members = self._stored.members, []
+        if members and self._shell.going:
             now_ns = time.time_ns()
-            self._shell.take(each.as_sample(now_ns) for each in self._stored.members)
-            count, path = len(self._stored.members), self._stored.path
-            _LOG.info("%d members of the set are stored in %s", count, path)
+            self._shell.take(each.as_sample(now_ns) for each in members)
+            _LOG.info("%d members of the set are stored in %s", len(members), self._stored.path)
 
     def _store_and_filter(self, samples: Sequence[Sample]) -> list[Sample]:
         self._stored.note(samples)
@@ -129,8 +129,8 @@ class CentralShell:
         self._shell.take(self._long_lost())
         self._give_up()
         self._request_orders()
-        self._missing.look(self.node.requests())
-        self._gather()
+        self._shell.contain("requests", lambda: self._missing.look(self.node.requests()))
+        self._shell.contain("requests", self._gather)
 
     def _patient(self, samples: Sequence[Sample]) -> list[Sample]:
         """Drop the tokens of lost robots that may return within LOST_S."""

@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from teamslam.central import saved_maps
+from teamslam.central.desk.verification.centre import recorded_map
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.central.saved_maps import NothingToSaveError, save_map
@@ -297,6 +298,13 @@ def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
     without = fold.make_map("final")[-1].message
     assert numbers(without) == numbers(final_map(second_day(loaded=False)[0]))
     assert without.withdrawn == ("map-site",)
+
+
+def test_the_saved_map_of_a_log_is_that_of_its_centre():
+    samples, centre, _ = second_day()
+    recorded = Recorded()
+    recorded.take_all(samples)
+    assert recorded_map(recorded, "both") == centre.maps.fold.save_map("both")
 
 
 def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():

@@ -187,6 +187,24 @@ def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(t
         assert loop.written == 0, "the key is of no channel"
 
 
+def test_a_centre_that_fails_to_list_measurements_looks_for_missing_submaps(monkeypatch):
+    shell = CentralShell(MemoryBus(MemoryNetwork()), CENTRE, ["r1"], threading.Event())
+    looks: list[int] = []
+
+    def fail() -> None:
+        raise ZeroDivisionError("no way")
+
+    def look() -> list[m.SubmapsRequest]:
+        looks.append(1)
+        return []
+
+    monkeypatch.setattr(shell.node, "requests", fail)
+    monkeypatch.setattr(shell.node, "lacking", look)
+    shell._duty()
+    assert looks
+    assert shell._shell.boundary.faults == 1
+
+
 def test_what_can_not_be_published_is_a_fault_and_the_rest_is_published(monkeypatch):
     network = MemoryNetwork()
     bus, sink = MemoryBus(network), MemoryBus(network)
