@@ -24,8 +24,7 @@ from teamslam.sim.studies.estimators.innovation import innovation
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
-from teamslam.team.estimation.models import Increment, increment_of
-from teamslam.team.estimation.odometry import segmenter_of
+from teamslam.team.estimation.models import Increment, increment_of, segmenter_of
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded, encoded

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import RobotConfig
-from teamslam.team.core import packed, unpacked
+from teamslam.team.core import OdometryInterval, packed, unpacked
 from teamslam.team.estimation.contribution import (
     NO_OWN,
     Contribution,
@@ -19,8 +19,9 @@ from teamslam.team.estimation.contribution import (
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix
 from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
-from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
+from teamslam.team.estimation.models import steered
 from teamslam.team.estimation.scans import Scan
+from teamslam.team.estimation.se2 import logarithm
 from teamslam.team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
@@ -94,9 +95,12 @@ def interval_of(message: m.AnyOdometry, config: RobotConfig) -> OdometryInterval
         case m.Increment():
             covariance = floats(message.covariance, "covariance").astype(np.float64).reshape(-1, 3)
             increment = floats(message.increment, "increment").astype(np.float64)
-            motion = moved(increment, covariance if message.covariance else None)
-            rates = motion.twist / max(duration_ns * 1e-9, 1e-9)
-            return OdometryInterval(end_ns, duration_ns, float(rates[0]), float(rates[2]), *motion)
+            twist = logarithm(increment)
+            rates = twist / max(duration_ns * 1e-9, 1e-9)
+            own = covariance if message.covariance else None
+            return OdometryInterval(
+                end_ns, duration_ns, float(rates[0]), float(rates[2]), twist, own
+            )
 
 
 def detections_of(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from teamslam.sim.radio.bus import reach_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import WorldStreams
-from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.hybrid_slam.window import generator
 
 Reach = Callable[[str, str, int], bool]
 """Whether two nodes reach each other at a team time [ns]."""

@@ -10,7 +10,8 @@ from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.publisher.source import Source
 from teamslam.sim.world.streams import Detections, Intervals, RobotStream, WorldStreams
 from teamslam.team.config import MotionModel, RobotConfig
-from teamslam.team.estimation.odometry import moved, steered
+from teamslam.team.estimation.models import steered
+from teamslam.team.estimation.se2 import logarithm
 from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.wire import messages as m
 
@@ -98,7 +99,7 @@ def _as_speeds(intervals: Intervals, motion: MotionModel) -> Intervals:
         speeds = np.array([steered(motion, *pair) for pair in speeds.tolist()]).reshape(-1, 2)
     if intervals.increments is not None:
         moving = intervals.as_motions
-        twists = [moved(each, None).twist for each in intervals.increments[moving]]
+        twists = [logarithm(each) for each in intervals.increments[moving]]
         rates = np.array(twists).reshape(-1, 3) / (intervals.duration_ns[moving, np.newaxis] * 1e-9)
         speeds[moving] = rates[:, [0, 2]]
     return replace(intervals, forward=speeds[:, 0], yaw_rate=speeds[:, 1], steered=False)

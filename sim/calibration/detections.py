@@ -23,7 +23,7 @@ from teamslam.team.estimation.association.certainty import estimate_view
 from teamslam.team.estimation.association.clustering import Clusters, cluster_window
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, relative_to
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
-from teamslam.team.estimation.odometry import segmenter_of
+from teamslam.team.estimation.models import segmenter_of
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
 

@@ -14,7 +14,7 @@ from teamslam.sim.scenarios.source import tells_map
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.containment import Boundary
-from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.robot.node import RobotNode, robot_node
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

@@ -1,4 +1,4 @@
-"""The motion of one interval as a Gaussian on SE(2), and the range-bearing sensor.
+"""Motion of one interval as a Gaussian on SE(2), a robot's segmenter, and the range-bearing sensor.
 
 Thrun, Burgard and Fox 2005, sections 5.3 and 6.6, but with motion noise in the tangent space of the
 motion's end, so that motions compose.
@@ -12,23 +12,31 @@ import msgspec
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.config import MotionModel, MotionNoise, Sensor
+from teamslam.team.config import Bounds, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import NEAREST_M, located, predicted
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Bool, Float
 
 __all__ = [
+    "LONGEST_NS",
     "NEAREST_M",
     "Increment",
     "Noise",
     "corrected",
     "increment_of",
     "located",
+    "nanoseconds",
     "noise",
     "noise_of",
     "predicted",
     "scanned",
+    "segmenter_of",
+    "steered",
+    "stream_bounds",
 ]
+
+LONGEST_NS = 2**62  # bound of the difference of two stamps
+_BOUNDS = Bounds()
 
 
 class Increment(msgspec.Struct, frozen=True, gc=False):
@@ -88,6 +96,23 @@ def increment_of(
 ) -> Increment:
     """Compute the motion of speeds [m/s, rad/s] held for `duration_s`."""
     return Increment(*model_of(motion).increment(duration_s, forward, yaw_rate))
+
+
+def steered(motion: MotionModel, wheel_speed: float, steering: float) -> tuple[float, float]:
+    """Compute (forward [m/s], yaw rate [rad/s]) of a car from wheel and steering encoders.
+
+    With s = steering + steering_offset, v = u/(1 − tan(s) h/L) and ω = v tan(s)/L: the wheel at (0,
+    h) of a base that turns at ω moves at u = v − ω h (Nebot, Victoria Park). NaN for models other
+    than a car's, or a wheel at the centre of the turn.
+    """
+    if motion.kind != "ackermann" or motion.wheel_base is None:
+        return math.nan, math.nan
+    slope = core.tan(steering + motion.steering_offset)
+    share = 1.0 - slope * motion.wheel_offset / motion.wheel_base
+    if not share > 0.0:
+        return math.nan, math.nan
+    forward = wheel_speed / share
+    return forward, forward * slope / motion.wheel_base
 
 
 def noise(sensor: Sensor, predicted_range: float) -> tuple[float, float]:
@@ -153,4 +178,41 @@ def noise_of(sensor: Sensor) -> Noise:
         sensor.range_white,
         core.squared(sensor.bearing_sigma),
         sensor.bearing_white,
+    )
+
+
+def nanoseconds(seconds: float) -> int:
+    """Convert a configured duration to ns, bounded by the span of stamps."""
+    return min(round(seconds * 1e9), LONGEST_NS)
+
+
+def segmenter_of(
+    motion: MotionModel,
+    sensor: Sensor,
+    keyframe_s: float,
+    window_s: float | None = None,
+    bounds: Bounds = _BOUNDS,
+) -> core.Segmenter:
+    """Make the segmenter of a robot's stream; window_s: of a stream with windows."""
+    return core.Segmenter(
+        model_of(motion),
+        np.array(sensor.mount) if sensor.is_mounted else None,
+        calibration_of(sensor),
+        sensor.covariance_factor,
+        nanoseconds(keyframe_s),
+        LONGEST_NS if window_s is None else nanoseconds(window_s),
+        stream_bounds(bounds),
+    )
+
+
+def stream_bounds(bounds: Bounds) -> core.StreamBounds:
+    """Convert the bounds of a sensor stream to the core's."""
+    return core.StreamBounds(
+        nanoseconds(bounds.jump_s),
+        bounds.interval_s,
+        bounds.speed_m_s,
+        bounds.yaw_rate_rad_s,
+        bounds.extent_m,
+        bounds.sigma_m,
+        bounds.sigma_rad,
     )

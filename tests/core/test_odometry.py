@@ -8,10 +8,9 @@ import pytest
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import OdometryInterval, Scan
-from teamslam.team.estimation.models import Increment, increment_of, model_of
+from teamslam.team.estimation.models import Increment, increment_of, model_of, segmenter_of
 from teamslam.team.estimation.mount import of_sensor
-from teamslam.team.estimation.odometry import moved, segmenter_of
-from teamslam.team.estimation.se2 import adjoint, inverse
+from teamslam.team.estimation.se2 import adjoint, inverse, logarithm
 
 MOTION = MotionModel(
     forward=MotionNoise(per_s=0.05, per_m=0.02),
@@ -100,7 +99,7 @@ def test_an_unmeasured_motion_has_the_last_speeds_and_a_spread_as_large_as_itsel
 
 def test_a_motion_that_was_measured_goes_on_by_its_parts():
     segmenter = segmenter_of(MOTION, Sensor(), 0.0)
-    whole = OdometryInterval(8, 8, 0.0, 0.0, *moved(np.array([0.4, 0.1, 0.3]), 0.01 * np.eye(3)))
+    whole = OdometryInterval(8, 8, 0.0, 0.0, logarithm(np.array([0.4, 0.1, 0.3])), 0.01 * np.eye(3))
     segmenter.observe(2, UNNAMED_SCAN)
     segmenter.integrate(whole, True)
     (keyframe,) = segmenter.take_keyframes()

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation import models
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.models import Increment, increment_of
-from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.se2 import compose, exponential, inverse, logarithm
 
 quick = settings(deadline=None, max_examples=60)

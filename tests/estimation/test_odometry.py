@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from teamslam.team.config import MotionModel, MotionNoise
-from teamslam.team.estimation.models import Increment, increment_of, model_of
-from teamslam.team.estimation.odometry import OdometryInterval, moved, steered
+from teamslam.team.core import OdometryInterval
+from teamslam.team.estimation.models import Increment, increment_of, model_of, steered
 from teamslam.team.estimation.se2 import between, exponential, logarithm
 
 SECOND = 1_000_000_000
@@ -20,7 +20,7 @@ CLAIM = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.004], [0.002, -0.004, 0.0
 
 
 def interval(increment: list[float], claim: np.ndarray | None = None) -> OdometryInterval:
-    return OdometryInterval(SECOND, SECOND, 0.0, 0.0, *moved(np.array(increment), claim))
+    return OdometryInterval(SECOND, SECOND, 0.0, 0.0, logarithm(np.array(increment)), claim)
 
 
 def part(whole: OdometryInterval, motion: MotionModel, duration_ns: int, rest_ns: int) -> Increment:

@@ -5,8 +5,7 @@ from msgspec.structs import replace
 from teamslam.team import core
 from teamslam.team.config import Bounds, Sensor
 from teamslam.team.core import landmarks_along_paths
-from teamslam.team.estimation.models import noise_of, predicted
-from teamslam.team.estimation.odometry import stream_bounds
+from teamslam.team.estimation.models import noise_of, predicted, stream_bounds
 from teamslam.team.estimation.scans import POINT, POLAR, Scan, unclaimed
 from teamslam.team.rejection import BY_CORE, Rejection
 from tests.estimation.hybrid_slam import one_landmark

@@ -18,7 +18,8 @@ from teamslam.central.desk.names import in_order
 from teamslam.central.diagnosis import MIRRORED_REMEDY, clock_remedy
 from teamslam.team import translate
 from teamslam.team.config import GATE, RobotConfig, Sensor
-from teamslam.team.estimation.odometry import moved, steered
+from teamslam.team.estimation.models import steered
+from teamslam.team.estimation.se2 import logarithm
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
@@ -85,7 +86,7 @@ class Timed:
             case m.Increment():
                 per_s = 1.0 / max(1e-9 * message.duration_ns, 1e-9)
                 increment = floats(message.increment, "increment").astype(np.float64)
-                self.motions.extend((per_s * moved(increment, None).twist).tolist())
+                self.motions.extend((per_s * logarithm(increment)).tolist())
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,8 @@ from teamslam.team import translate
 from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.se2 import wrapped
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m

@@ -8,10 +8,10 @@ import numpy as np
 
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import RobotConfig
+from teamslam.team.core import OdometryInterval
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import Innovation
-from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import ESTIMATORS

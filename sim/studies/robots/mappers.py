@@ -21,7 +21,7 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
 from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindow
-from teamslam.team.estimation.odometry import stream_bounds
+from teamslam.team.estimation.models import stream_bounds
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
 from teamslam.team.rejection import BY_CORE, UNMEASURED, Rejection

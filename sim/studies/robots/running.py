@@ -18,11 +18,9 @@ from teamslam.team.estimation.gaussian import (
     NotACovarianceError,
     PoseGaussian,
 )
-from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.estimation.models import Increment
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, generator
+from teamslam.team.estimation.models import Increment, segmenter_of
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
-from teamslam.team.estimation.odometry import OdometryInterval, segmenter_of
-from teamslam.team.estimation.randomness import generator
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
@@ -86,7 +84,7 @@ class RunningEstimator:
             return Rejection.CLAIMS
         return BY_CORE[self._segmenter.observe(stamp_ns, scan)]
 
-    def drive(self, interval: OdometryInterval, *, measured: bool = True) -> Estimates:
+    def drive(self, interval: core.OdometryInterval, *, measured: bool = True) -> Estimates:
         """Process one odometry interval and its keyframes."""
         stamp_ns, begin_ns = interval.end_ns, interval.end_ns - interval.duration_ns
         if self._segmenter.now_ns is None:

@@ -12,7 +12,7 @@ from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep, un
 from teamslam.sim.studies.rules.measurement_rules import MapContent, MeasurementCentre
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
 from teamslam.team.estimation.gaussian import Matrix, NotACovarianceError, PoseGaussian
-from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.wire.bus import Outgoing
 

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig
-from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.odometry import segmenter_of
+from teamslam.team.estimation.models import Increment, segmenter_of
 from teamslam.team.rejection import BY_CORE, UNMEASURED
 from teamslam.team.robot.stream import Inbox
 from teamslam.team.wire import messages as m

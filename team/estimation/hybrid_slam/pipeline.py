@@ -37,12 +37,11 @@ from teamslam.team.estimation.hybrid_slam.window import (
     Innovation,
     RunningWindow,
     Window,
+    random_numbers,
 )
 from teamslam.team.estimation.inter_robot import CarriedPoint
-from teamslam.team.estimation.models import Increment, noise_of
-from teamslam.team.estimation.odometry import OdometryInterval, nanoseconds, segmenter_of
+from teamslam.team.estimation.models import Increment, nanoseconds, noise_of, segmenter_of
 from teamslam.team.estimation.plausibility import submap_beyond
-from teamslam.team.estimation.randomness import random_numbers
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import BY_CORE, Rejection
@@ -205,7 +204,7 @@ class HybridSlam:
         now_ns = self.segmenter.now_ns
         return now_ns is None or stamp_ns < now_ns
 
-    def drive(self, interval: OdometryInterval) -> ClosedWindow | None:
+    def drive(self, interval: core.OdometryInterval) -> ClosedWindow | None:
         """Process one odometry interval; return the window that it closes, if any."""
         return self.advance() if self.segmenter.drive(interval) >= DUE else None
 

@@ -7,11 +7,10 @@ from hypothesis import strategies as st
 
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.core import Keyframe, Scan
+from teamslam.team.core import Keyframe, OdometryInterval, Scan
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam, OpenWindow
 from teamslam.team.estimation.models import increment_of, predicted
-from teamslam.team.estimation.odometry import OdometryInterval
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.wire import messages as m
 from tests import build

@@ -6,14 +6,13 @@ from hypothesis import strategies as st
 
 from teamslam.team import core
 from teamslam.team.config import FrontEnd, Gnss, MotionModel, MotionNoise, Sensor
-from teamslam.team.core import POSE_JITTER
+from teamslam.team.core import POSE_JITTER, OdometryInterval
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid
 from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.map_joining.conditioning import SubmapCorrection
-from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.odometry import OdometryInterval, segmenter_of
+from teamslam.team.estimation.models import Increment, segmenter_of
 from tests.estimation.submap_world import seen_from, wrap
 from tests.teams import config
 

@@ -4,7 +4,7 @@ import pytest
 from teamslam.team.config import UNNAMED, AssociationSettings, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import Keyframe, Scan, TimedScan
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import associate_keyframes, events_of
-from teamslam.team.estimation.odometry import segmenter_of
+from teamslam.team.estimation.models import segmenter_of
 
 TICK = 10**8
 LANDMARKS = np.array([[3.0, 0.5], [3.0, -1.5], [5.0, 1.0]])

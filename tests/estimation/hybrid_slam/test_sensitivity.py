@@ -10,6 +10,7 @@ from teamslam.team import core
 from teamslam.team.config import BIASES, FrontEnd, MotionModel, MotionNoise, Sensor
 from teamslam.team.estimation import se2
 from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.window import random_numbers
 from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
@@ -18,7 +19,6 @@ from teamslam.team.estimation.map_joining.joining import (
     solve_fold,
 )
 from teamslam.team.estimation.models import increment_of, noise_of
-from teamslam.team.estimation.randomness import random_numbers
 from tests.core.test_odometry import shift_of
 from tests.estimation.submap_world import local_truth, team, wrap
 

@@ -14,8 +14,8 @@ from teamslam.team.core import POSE_JITTER, moments, sample_factor
 from teamslam.team.estimation.consistency import nees, state_error
 from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.hybrid_slam import window as windows
+from teamslam.team.estimation.hybrid_slam.window import random_numbers
 from teamslam.team.estimation.models import Increment, increment_of
-from teamslam.team.estimation.randomness import random_numbers
 from tests.estimation.submap_world import wrap
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)

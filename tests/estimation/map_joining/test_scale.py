@@ -7,7 +7,7 @@ nothing in sight between. Truth and measurements are made without the estimator'
 import numpy as np
 
 from teamslam.team.config import FrontEnd
-from teamslam.team.estimation.randomness import generator
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.library import (
     InitialPose,
     Keyframe,

@@ -7,8 +7,8 @@ from teamslam.sim.studies.estimators import plain_fastslam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
+from teamslam.team.estimation.hybrid_slam.window import random_numbers
 from teamslam.team.estimation.models import increment_of
-from teamslam.team.estimation.randomness import random_numbers
 from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, ROBOT, drive, driven
 
 PROPOSALS = ["fastslam1", "fastslam2"]

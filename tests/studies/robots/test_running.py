@@ -18,10 +18,10 @@ from teamslam.sim.studies.robots.estimator import (
 )
 from teamslam.sim.studies.robots.running import POSE_FLOOR
 from teamslam.team import translate
+from teamslam.team.core import OdometryInterval
 from teamslam.team.estimation.gaussian import NO_LANDMARKS
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.models import Increment, corrected, increment_of
-from teamslam.team.estimation.odometry import OdometryInterval
-from teamslam.team.estimation.randomness import generator
 from teamslam.team.robot.node import robot_node
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

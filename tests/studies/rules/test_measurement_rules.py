@@ -11,8 +11,8 @@ from teamslam.sim.studies.estimators import joint_fastslam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.rules.joint_fastslam_rule import RESAMPLE_BELOW
 from teamslam.team import translate
+from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.models import increment_of
-from teamslam.team.estimation.randomness import generator
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Outgoing
