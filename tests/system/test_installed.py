@@ -74,7 +74,7 @@ def test_the_wheel_holds_one_package_and_nothing_else(wheel):
         f"teamslam/{path.relative_to(ROOT).as_posix()}".replace("teamslam/teamslam/", "teamslam/")
         for package in (*FOLDERS, "teamslam")
         for path in (ROOT / package).rglob("*")
-        if path.suffix in {".py", ".pyi", ".toml", ".html", ".js", ".css", ".svg"}
+        if path.suffix in {".py", ".pyi", ".toml", ".html", ".js", ".json", ".css", ".svg"}
         or path.name == "py.typed"
     }
     assert shipped == {name for name in expected if "team/core/building/" not in name}
