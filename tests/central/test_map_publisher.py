@@ -204,3 +204,21 @@ def test_a_robot_that_comes_to_landmarks_that_it_was_not_told_is_told():
     sent_priors.is_worth(ROBOT, HERE, blocks())
     assert not sent_priors.is_worth(ROBOT, np.array([20.0, 0.0, 0.0]), blocks())
     assert sent_priors.is_worth(ROBOT, np.array([30.0, 0.0, 0.0]), blocks())
+
+
+def test_a_withdrawal_that_is_revoked_and_decided_again_is_announced_twice(monkeypatch):
+    found, convicted = rule(), dict[str, str]()
+    monkeypatch.setattr(SubmapFold, "convicted", property(lambda _: dict(convicted)))
+    said = []
+    for reason in ({"r2": "it slips"}, {"r2": "it slips"}, {}, {"r2": "it slips again"}):
+        convicted.clear()
+        convicted.update(reason)
+        said.append(
+            [(each.robot, each.reason) for each in of(found.publish_final(0), ch.WITHDRAWAL)]
+        )
+    assert said == [[("r2", "it slips")], [], [], [("r2", "it slips again")]]
+    assert found.warnings == [
+        "r2 withdrawn by central: it slips",
+        "r2 is withdrawn no more: what came late speaks for it",
+        "r2 withdrawn by central: it slips again",
+    ]
