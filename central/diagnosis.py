@@ -296,7 +296,7 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     shared = np.bincount(own, minlength=len(submaps))
 
     def sums(values: Values) -> Values:
-        return np.bincount(own, values, len(submaps))
+        return np.bincount(own, values, len(submaps)).astype(np.float64)  # integers if empty
 
     x, y, u, v = (
         values - (sums(values) / np.maximum(shared, 1))[own]
