@@ -288,7 +288,7 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     count = seen.sum(axis=0)
 
     of = np.repeat(np.arange(len(submaps)), [len(each.local.ids) for each in submaps])
-    ids = [id_ for each in submaps for id_ in each.local.ids.tolist()]
+    ids = np.concatenate([each.local.ids for each in submaps]).tolist()
     node = np.array([graph.landmarks.get(id_, -1) if id_ < UNNAMED else -1 for id_ in ids], int)
     is_shared = (node >= 0) & (count[node] > seen[of_robot[of], node])
     points = np.concatenate([each.local.landmarks for each in submaps])[is_shared]

@@ -111,8 +111,8 @@ class SentPriors:
         frame: Stream | None = None,
     ) -> bool:
         """Whether to send a prior at this pose (None: of landmarks alone); if so, note it."""
-        offsets = blocks.means if pose is None else blocks.means - pose[:2]
-        nearest = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
+        x, y = (blocks.means if pose is None else blocks.means - pose[:2]).T
+        nearest = (x * x + y * y).argsort(kind="stable")
         old = self._sent.get(stream)
         if (
             old is None
@@ -143,14 +143,14 @@ def _has_changed(
     ids = now.ids[needed]
     if not len(needed):
         return False
-    at = np.searchsorted(old.ids, ids)
+    at = old.ids.searchsorted(ids)
     if at.max() == len(old.ids) or (old.ids[at] != ids).any():
         return True
-    before = np.searchsorted(old.blocks.ids, ids)
-    moved = now.means[needed] - old.blocks.means[before]
+    before = old.blocks.ids.searchsorted(ids)
+    x, y = (now.means[needed] - old.blocks.means[before]).T
     variances, were = (
         each[:, 0, 0] + each[:, 1, 1]
         for each in (now.covariances[needed], old.blocks.covariances[before])
     )
-    share = 2.0 * (moved * moved).sum(axis=1) / variances
-    return bool(share.mean() > core.squared(MOVED) or (variances < SURER * were).any())
+    share = 2.0 * (x * x + y * y) / variances
+    return bool(share.sum() / len(share) > core.squared(MOVED) or (variances < SURER * were).any())

@@ -22,7 +22,7 @@ from teamslam.team.estimation.map_joining.conditioning import RobotPrior, Submap
 from teamslam.team.estimation.models import steered
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import logarithm
-from teamslam.team.estimation.submap import NO_COLUMNS, LocalMap, Unnamed
+from teamslam.team.estimation.submap import NO_COLUMNS, NONE_UNNAMED, LocalMap, Unnamed
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import (
@@ -169,6 +169,8 @@ def local_map_of(message: m.Submap) -> LocalMap:
 
 
 def _unnamed_of(message: m.Submap) -> Unnamed:
+    if not message.counts and not message.keyframes:
+        return NONE_UNNAMED
     counts = ids(message.counts, "counts").astype(np.uint32)
     rows = octets(message.seen, "seen").reshape(len(counts), -(-message.keyframes // 8))
     seen = np.unpackbits(rows, axis=1, count=message.keyframes, bitorder="little")

@@ -201,12 +201,12 @@ class Contribution:
     def factor(self) -> core.SubmapFactor:
         """Submap as a factor. Raises NotACovarianceError that names it."""
         local = self.local
-        P, n = local.covariance, len(local.mean)
-        x = np.arange(n - 2 * len(local.ids), n, 2)
+        first = len(local.mean) - 2 * len(local.ids)
+        variances, covariances = (local.covariance.diagonal(k)[first:] for k in (0, 1))
         return core.SubmapFactor(
             local.mean,
             self.information,
-            np.column_stack([P[x, x], P[x, x + 1], P[x + 1, x + 1]]),
+            np.array([variances[::2], covariances[::2], variances[1::2]]).T.copy(),
             local.sensitivity,
             np.array([RANGE_POWER[each] for each in local.biases], np.int64),
             is_measured=not is_map(self.stream),

@@ -60,12 +60,12 @@ class SubmapCosts:
         return weight
 
     @cached_property
-    def of_robots(self) -> Mapping[str, list[int]]:
+    def of_robots(self) -> Mapping[str, Indices]:
         """Places of each robot's submaps, robots by name."""
         places: dict[str, list[int]] = {}
         for place, (robot, _) in enumerate(self.streams):
             places.setdefault(robot, []).append(place)
-        return {robot: places[robot] for robot in sorted(places)}
+        return {robot: np.array(places[robot]) for robot in sorted(places)}
 
     def select(self, places: Sequence[int]) -> "SubmapCosts":
         """Select submaps by place."""
@@ -73,7 +73,9 @@ class SubmapCosts:
 
     def followed_by(self, later: "SubmapCosts") -> "SubmapCosts":
         """Append later submaps."""
-        return SubmapCosts(self.streams + later.streams, np.hstack([self.table, later.table]))
+        return SubmapCosts(
+            self.streams + later.streams, np.concatenate([self.table, later.table], axis=1)
+        )
 
 
 class EliminatedPath(NamedTuple):

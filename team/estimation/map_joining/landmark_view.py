@@ -25,8 +25,8 @@ def members(island: Island, ids: Sequence[int]) -> Int64[np.ndarray, " L"]:
     """Return the node of each landmark, or -1 - its place at rest. Raises KeyError."""
     landmarks, old = island.graph.landmarks, island.graph.condensed
     place = {} if old is None else old.place
-    found = (landmarks[id_] if id_ in landmarks else -1 - place[id_] for id_ in ids)
-    return np.fromiter(found, np.int64, len(ids))
+    found = [landmarks[id_] if id_ in landmarks else -1 - place[id_] for id_ in ids]
+    return np.array(found, np.int64)
 
 
 def points_of(island: Island, ids: Sequence[int]) -> Float[np.ndarray, "L 2"]:

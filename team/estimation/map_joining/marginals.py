@@ -24,7 +24,7 @@ from teamslam.team.estimation.map_joining.landmark_view import (
     points_of,
 )
 from teamslam.team.estimation.map_joining.submap_graph import Graph
-from teamslam.team.shapes import Bool, Float, UInt32
+from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 BELIEVED = 0.5  # least weight of a landmark in a submap for the submap to be believed about it
 
@@ -365,20 +365,19 @@ def _terms(island: Island) -> Terms:
     costs = np.array([now.whole_chi2, left, weight, chi2_quantile(0.5, left)])
     ranks = np.array([each.rank for each in graph.priors], np.int64)
     of_priors, of_sightings = now.prior_weights, now.sighting_weights
-    counted = (
-        [weight * now.counted_chi2, now.dimensions - taken],
-        [of_priors * now.prior_chi2, ranks - of_priors * now.explained_by_priors],
-        [
-            of_sightings * now.sighting_chi2,
-            2.0 - of_sightings * now.explained_by_sightings,
-        ],
+    chi2 = weight * now.counted_chi2, of_priors * now.prior_chi2, of_sightings * now.sighting_chi2
+    dof = (
+        now.dimensions - taken,
+        ranks - of_priors * now.explained_by_priors,
+        2.0 - of_sightings * now.explained_by_sightings,
     )
+    counted = np.array([np.concatenate(chi2), np.concatenate(dof)])
     robots = (
         *(each.robot for each in of),
         *_robots_of_priors(graph),
         *(each.sighting.robot for each in graph.sightings),
     )
-    return Terms(SubmapCosts(tuple(each.stream for each in of), costs), robots, np.hstack(counted))
+    return Terms(SubmapCosts(tuple(each.stream for each in of), costs), robots, counted)
 
 
 def _robots_of_priors(graph: Graph) -> list[str]:
@@ -390,7 +389,7 @@ def _robots_of_priors(graph: Graph) -> list[str]:
     return [robots[each.nodes[0]] for each in graph.priors]
 
 
-def scale_of(costs: SubmapCosts, of: Sequence[int] | slice = ALL) -> Scale | None:
+def scale_of(costs: SubmapCosts, of: Int64[np.ndarray, " _"] | slice = ALL) -> Scale | None:
     """Estimate the covariance scale of some submaps; None with too few degrees of freedom."""
     chi2, dof, _, medians = costs.table[:, of]
     return covariance_scale(chi2, dof, medians)
