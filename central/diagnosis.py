@@ -304,18 +304,20 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     )
     xu, yv, xv, yu = sums(x * u), sums(y * v), sums(x * v), sums(y * u)
     gain = 2.0 * (core.hypot(xu - yv, xv + yu) - core.hypot(xu + yv, yu - xv))
-    for k, robot in enumerate(robots):
-        chain = np.flatnonzero((of_robot == k) & (shared >= LEAST_SHARED))
-        fit = np.count_nonzero(gain[chain] > 0.0)
-        if len(chain) < LEAST_MIRRORED or fit < MIRRORED * len(chain):
-            continue
+    is_judged = shared >= LEAST_SHARED
+    judged, fit = (
+        np.bincount(of_robot[which], minlength=len(robots))
+        for which in (is_judged, is_judged & (gain > 0.0))
+    )
+    for k in np.flatnonzero((judged >= LEAST_MIRRORED) & (fit >= MIRRORED * judged)).tolist():
+        chain = np.flatnonzero(is_judged & (of_robot == k)).tolist()
         chi2 = [
             gain[s] / median(submaps[s].factor.landmarks[is_shared[of == s]][:, [0, 2]].ravel())
-            for s in chain.tolist()
+            for s in chain
         ]
         yield m.Diagnosis(
             cause="mirrored",
-            robot=robot,
+            robot=robots[k],
             value=(-1.0,),
             sigma=(0.0,),
             evidence=math.fsum(chi2) / len(chain),
