@@ -291,6 +291,8 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     ids = np.concatenate([each.local.ids for each in submaps]).tolist()
     node = np.array([graph.landmarks.get(id_, -1) if id_ < UNNAMED else -1 for id_ in ids], int)
     is_shared = (node >= 0) & (count[node] > seen[of_robot[of], node])
+    if not is_shared.any():
+        return
     points = np.concatenate([each.local.landmarks for each in submaps])[is_shared]
     at, own = graph.offset[node[is_shared]], of[is_shared]
     shared = np.bincount(own, minlength=len(submaps))
