@@ -60,12 +60,12 @@ class SubmapCosts:
         return weight
 
     @cached_property
-    def of_robots(self) -> Mapping[str, Indices]:
+    def of_robots(self) -> Mapping[str, list[int]]:
         """Places of each robot's submaps, robots by name."""
         places: dict[str, list[int]] = {}
         for place, (robot, _) in enumerate(self.streams):
             places.setdefault(robot, []).append(place)
-        return {robot: np.array(places[robot]) for robot in sorted(places)}
+        return {robot: places[robot] for robot in sorted(places)}
 
     def select(self, places: Sequence[int]) -> "SubmapCosts":
         """Select submaps by place."""

@@ -24,7 +24,7 @@ from teamslam.team.estimation.map_joining.landmark_view import (
     points_of,
 )
 from teamslam.team.estimation.map_joining.submap_graph import Graph
-from teamslam.team.shapes import Bool, Float, Int64, UInt32
+from teamslam.team.shapes import Bool, Float, UInt32
 
 BELIEVED = 0.5  # least weight of a landmark in a submap for the submap to be believed about it
 
@@ -389,7 +389,7 @@ def _robots_of_priors(graph: Graph) -> list[str]:
     return [robots[each.nodes[0]] for each in graph.priors]
 
 
-def scale_of(costs: SubmapCosts, of: Int64[np.ndarray, " _"] | slice = ALL) -> Scale | None:
+def scale_of(costs: SubmapCosts, of: Sequence[int] | slice = ALL) -> Scale | None:
     """Estimate the covariance scale of some submaps; None with too few degrees of freedom."""
     chi2, dof, _, medians = costs.table[:, of]
     return covariance_scale(chi2, dof, medians)
