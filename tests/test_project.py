@@ -9,13 +9,15 @@ from importlib import metadata
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
+import jaxtyping
 import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from benchmarks.baseline import baselines
-from teamslam.team import extras
+from teamslam.sim.cli.main import load_all
+from teamslam.team import extras, shapes
 from tests.support import ROOT
 
 BUILDING = ("cmake", "nanobind", "ninja", "scikit-build-core")
@@ -186,6 +188,11 @@ def test_a_launch_and_its_report_need_no_scipy():
     assert "scipy" not in closure(*PROJECT["dependencies"])
 
 
+def test_shapes_are_checked_in_tests():
+    """They would not be if a plugin loaded `teamslam` before the import hook of conftest.py."""
+    assert shapes.Float is jaxtyping.Float
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lists a process's threads")
 def test_the_linear_algebra_of_a_command_has_one_thread():
     code = (
@@ -239,6 +246,14 @@ def test_the_compose_file_is_valid_by_the_compose_specification():
     command = [sys.executable, "-m", "check_jsonschema", *schema, str(COMPOSE)]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout
+
+
+def test_every_service_runs_a_command_with_options_that_exist(compose):
+    commands = load_all().commands
+    for name, service in compose["services"].items():
+        command, *words = service["command"]
+        commands[command].make_context(command, [*words])  # raises for an unknown option
+        assert ("tcp/router:7447" in words) == (name != "router")
 
 
 def test_nothing_is_published_beyond_the_host_itself(compose):
