@@ -1,6 +1,8 @@
+import msgspec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from teamslam.team.door import LATE_NS
 from teamslam.team.robot.stream import Inbox
 from teamslam.team.wire import messages as m
 from tests import build
@@ -25,14 +27,23 @@ def names(inbox):
     return [(each.incarnation, each.number) for each in taken]
 
 
+def received(inbox, arrived):
+    """As `RobotNode.handle`: a measurement in its turn is taken at once."""
+    if inbox.take(arrived):
+        return [(arrived.incarnation, arrived.number), *names(inbox)]
+    inbox.put(arrived)
+    return names(inbox)
+
+
 @settings(deadline=None)
 @given(st.permutations(list(range(12)) * 2), st.integers(1, 5))
 def test_any_order_with_duplicates_comes_out_in_order_and_once(order, at_once):
     inbox, out = Inbox(), []
     for i, number in enumerate(order):
-        inbox.put(measurement(number))
         if i % at_once == 0:
-            out += names(inbox)
+            out += received(inbox, measurement(number))
+        else:
+            inbox.put(measurement(number))
     out += names(inbox)
     assert out == [(0, number) for number in range(12)]
     assert waiting(inbox) == 0
@@ -43,11 +54,18 @@ def test_any_order_with_duplicates_comes_out_in_order_and_once(order, at_once):
 def test_of_two_incarnations_the_earlier_is_taken_as_far_as_it_is_there(order):
     inbox, out = Inbox(), []
     for incarnation, number in order:
-        inbox.put(measurement(number, incarnation))
-        out += names(inbox)
+        out += received(inbox, measurement(number, incarnation))
     assert out == sorted(out)
     assert [name for name in out if name[0] == 3] == [(3, number) for number in range(4)]
     assert waiting(inbox) == 0, "nothing of a past incarnation is kept"
+
+
+def test_stamps_are_bounded_by_the_initial_pose_of_the_first_incarnation_too():
+    inbox = Inbox()
+    assert received(inbox, build.initial_pose(incarnation=0)) == [(0, 0)]
+    late = msgspec.structs.replace(measurement(1), stamp_ns=2 * LATE_NS)
+    assert inbox.refusal(measurement(1)) is None
+    assert inbox.refusal(late) == "stamped 800 days after its stream began"
 
 
 def test_a_later_incarnation_whose_beginning_is_missing_is_a_gap():
