@@ -234,15 +234,24 @@ class Evaluation:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Missing robots, and measurements that contradict each other."""
+        """Missing robots, and wrong measurements in the map: mirrored, or contradicting."""
         of_map = () if self.map is None else self.map.diagnosis
         if not any(contradicts(each) and not each.robot for each in of_map):
-            return self.missing
+            return (*self.missing, *self._mirrored_in_the_map)
         causes = "; ".join(map(describe, self.diagnosis))
         return (
             *self.missing,
             "the measurements contradict each other far beyond the stated noise, so the map is not "
             f"to be used: {causes}",
+        )
+
+    @property
+    def _mirrored_in_the_map(self) -> tuple[str, ...]:
+        inside = {name for name, of in self.states.items() if of.state in {"joined", "alone"}}
+        return tuple(
+            f"the map is not to be used: {describe(each)}"
+            for each in self.diagnosis
+            if each.cause == "mirrored" and each.robot in inside
         )
 
     @property

@@ -7,6 +7,7 @@ import pytest
 from teamslam.central.desk.evaluation.clocks import Timed, mirrored_cause
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
+from teamslam.central.desk.evaluation.states import RobotState
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.wire import messages as m
 from tests.central.desk.test_clocks import published, timed_of
@@ -31,6 +32,20 @@ def test_a_robot_alone_with_mirrored_bearings_is_named_and_nothing_else_of_it(tm
     (found,) = to_json(evaluate(log))["diagnosis"]
     assert (found["cause"], found["robot"], found["value"]) == ("mirrored", "r1", -1.0)
     assert found["text"].startswith("r1's bearings have the wrong sign: negate")
+
+
+@pytest.mark.parametrize("mirrored", [("r1",), ("r1", "r2")])
+def test_a_map_with_mirrored_robots_fails_and_names_them(mirrored, tmp_path):
+    result = evaluate(published(replace(ALONE, robots=2, mirrored=mirrored), tmp_path))
+    inside = {robot: RobotState("joined") for robot in ("r1", "r2")}
+    failures = replace(result, states=inside).failures
+    assert len(failures) == len(mirrored)
+    for robot, failure in zip(mirrored, failures, strict=True):
+        assert f"not to be used: {robot}'s bearings have the wrong sign: negate" in failure
+    outside = inside | {robot: RobotState("withdrawn", "by operator") for robot in mirrored}
+    assert replace(result, states=outside).failures == tuple(
+        f"{robot} withdrawn: by operator" for robot in mirrored
+    )
 
 
 @pytest.mark.parametrize(
