@@ -111,16 +111,20 @@ def stream_of(
     unnamed: Detections | None = None,
 ) -> RobotStream:
     """Measurements of a robot's tables by kind; offset_ns: of the odometry's clock."""
-    intervals, notes = intervals_of(tables.get("odometry"), offset_ns)
-    driven = None
-    if len(intervals.end_ns):
-        driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
-    else:
-        notes.append("no odometry: only its observations are used")
     observed, sighted = tables.get("observations"), tables.get("sightings")
+    if all(each is None for each in (tables.get("odometry"), observed, sighted, unnamed)):
+        raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
+    intervals, notes = intervals_of(tables.get("odometry"), offset_ns)
+    if not len(intervals.end_ns):
+        raise DatasetError(
+            f"{robot}/odometry.csv: no odometry interval of {robot}, and without one it can not be "
+            "in the map: add the table (for a robot that stands still, rows of speed 0 at its "
+            f"first and last time), or remove the folder {robot}"
+        )
+    driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
-    if unnamed is not None and driven is not None:
+    if unnamed is not None:
         unnamed = unnamed.within(*driven)
     if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")
@@ -128,15 +132,12 @@ def stream_of(
     notes += more
     fixes_ns, fixes, more = rows.fixes_of(tables.get("fixes"), driven)
     notes += more
-    saw = len(seen.stamps_ns) or len(teammates.stamps_ns) or unnamed is not None
-    if driven is None and not saw:
-        raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
     truth_ns, poses, more = rows.truth_of(tables.get("truth"), driven)
     notes += more if len(poses) else ["no truth.csv: its trajectory's error can not be computed"]
     start = tables.get("start")
     landmarks = merge_detections(_insert_empty(seen.grouped(), empty_ns), unnamed)
     mates = teammates.grouped()
-    begins = (np.array(driven or (), np.int64), landmarks.stamps_ns[:1], mates.stamps_ns[:1])
+    begins = (np.array(driven, np.int64), landmarks.stamps_ns[:1], mates.stamps_ns[:1])
     return RobotStream(
         robot=robot,
         start_ns=int(np.concatenate(begins).min()),

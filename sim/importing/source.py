@@ -104,6 +104,9 @@ def _own_form(request: Request, folder: Path) -> Report:
         variances = [sigmas[0] ** 2, sigmas[0] ** 2, sigmas[1] ** 2] if sigmas else None
         start = StartPose(pose, None if variances is None else np.diag(variances))
         robots[robot] = replace(robots[robot], start=start)
+    for name in [each for each, stream in robots.items() if not len(stream.intervals.end_ns)]:
+        del robots[name]
+        notes.append(f"{name} has no odometry and is left out")
     write_folder(replace(streams, streams=tuple(robots.values())), folder)
     (folder / SCENARIO).write_text(folder_scenario(scenario), "utf-8")
     notes += [*streams.notes, *(f"{s.robot}: {note}" for s in streams.streams for note in s.notes)]

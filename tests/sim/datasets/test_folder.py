@@ -399,6 +399,26 @@ def test_a_file_that_is_no_data_set_is_refused_with_all_formats(tmp_path, conten
     assert [each for each in expected if each not in str(refused.value)] == []
 
 
+@pytest.mark.parametrize("table", [None, "t_s,forward_m_s,yaw_rate_rad_s\n1,0,0\n"])
+def test_a_robot_without_odometry_is_refused_with_file_and_remedy(tmp_path, table):
+    of_it = {} if table is None else {"odometry": table}
+    path = data_set(tmp_path / "a", observations=SEEN, **of_it)
+    for command in (
+        ("launch", "--dataset", path),
+        ("rerun", path),
+        ("import", path, "-o", tmp_path / "b"),
+    ):
+        refused = run(*command).exception
+        assert isinstance(refused, DatasetError)  # status 2 of the program
+        said = str(refused)
+        assert "r1/odometry.csv: no odometry interval of r1" in said
+        assert "stands still, rows of speed 0" in said
+        assert "remove the folder r1" in said
+    assert not (tmp_path / "b").exists()
+    standing = "t_s,forward_m_s,yaw_rate_rad_s\n0,0,0\n3,0,0\n"
+    assert len(only(data_set(path, odometry=standing)).intervals.end_ns) == 1
+
+
 def test_import_of_a_folder_without_measurements_makes_none(tmp_path):
     data_set(tmp_path / "a", landmarks="landmark,x_m,y_m\n1,2,3\n")
     done = run("import", tmp_path / "a", "-o", tmp_path / "b")
