@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from teamslam.central.desk.left_out import is_kept, spans_left_out
 from teamslam.central.desk.verification.recorded import Recorded, RerunError
 from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team import translate
@@ -37,7 +38,7 @@ class SmoothedPath:
 def smoothed_paths(
     found: Recorded, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, SmoothedPath]:
-    """Compute the path of every robot in the final map."""
+    """Compute the path of every robot in the final map, without spoilt parts (`left_out`)."""
     last: dict[tuple[str, int, int], m.Trajectory] = {}
     for message in found.of(m.Trajectory, ch.TRAJECTORY):
         begin = int(stamps(message.stamps, "stamps")[0])
@@ -47,7 +48,25 @@ def smoothed_paths(
         progress(robot)
         windows = _windows(found, robot, incarnation) if message.crosses else {}
         by_robot.setdefault(robot, []).append(_between_ends(found, message, windows))
-    return {robot: _join_parts(parts) for robot, parts in by_robot.items()}
+    maps = found.of(m.FusedMap, ch.FINAL_MAP)
+    causes = maps[-1].diagnosis if maps else ()
+    paths = {}
+    for robot, parts in by_robot.items():
+        path = _join_parts(parts)
+        ends = [
+            end
+            for message in last.values()
+            if message.robot == robot
+            for end in stamps(message.stamps, "stamps").tolist()
+        ]
+        kept = is_kept(path.stamps_ns, spans_left_out(causes, robot, ends))
+        paths[robot] = SmoothedPath(
+            path.stamps_ns[kept],
+            path.poses[kept],
+            path.covariances[kept],
+            at_keyframes=path.at_keyframes,
+        )
+    return paths
 
 
 def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:

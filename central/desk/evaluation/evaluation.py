@@ -40,6 +40,7 @@ from teamslam.central.desk.evaluation.results import (
 )
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.evaluation.states import robot_states, verdicts_given
+from teamslam.central.desk.left_out import describe_spans, is_kept, spans_left_out
 from teamslam.central.desk.names import data_set_of, in_order
 from teamslam.central.diagnosis import contradicts
 from teamslam.team import translate
@@ -89,10 +90,12 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
             return frames.has(frame)
         return message is None or not message.ids or frame in {"", message.frame}
 
+    causes = () if message is None else message.diagnosis
     robots = {}
     for robot in log.robots:
         uplink = _uplink_bytes(log, scenario, robot)
-        robots[robot] = _robot_result(log, robot, uplink, _own_map(log, robot, true), is_in_frame)
+        own_map = _own_map(log, robot, true)
+        robots[robot] = _robot_result(log, robot, uplink, own_map, is_in_frame, causes)
     truth_from_map = _motion(robots.values()) if arbitrary else np.zeros(3)
     fused = None
     if message is not None:
@@ -113,6 +116,7 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
             *log.disagreement,
             *_warn_of_missing(log),
             *_set_aside(faults),
+            *(n for name, each in robots.items() for n in describe_spans(name, each.left_out)),
         ),
         unsound=log.unsound,
         cost_by_robot=log.figures("central", "joint_cost_per_dof."),
@@ -428,6 +432,7 @@ def _robot_result(
     uplink_bytes: int | None,
     own_map: MapErrors | None,
     is_in_frame: Callable[[str], bool],
+    causes: Sequence[m.Diagnosis],
 ) -> RobotResult:
     trajectories = log.messages(ch.TRAJECTORY, m.Trajectory, robot)
     truths = log.messages(ch.TRUTH, m.Truth, robot)
@@ -436,6 +441,11 @@ def _robot_result(
         [translate.trajectory_of(t) for t in trajectories],
         [floats(t.covariances, "covariances") for t in trajectories],
     )
+    left_out = spans_left_out(causes, robot, smoothed.stamps_ns.tolist())
+    kept = is_kept(smoothed.stamps_ns, left_out)
+    smoothed = Path(smoothed.stamps_ns[kept], smoothed.poses[kept])
+    if len(smoothed_covariances):
+        smoothed_covariances = smoothed_covariances[kept]
     online_channel, estimates, outside = None, [], False
     for channel in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE):
         poses = log.messages(channel, m.PoseEstimate, robot)
@@ -460,6 +470,7 @@ def _robot_result(
         online_channel=online_channel,
         own_map=own_map,
         outside=outside,
+        left_out=left_out,
     )
 
 

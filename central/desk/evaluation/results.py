@@ -13,6 +13,7 @@ from teamslam.central.desk.evaluation.errors import MapErrors, Path, PoseErrors
 from teamslam.central.desk.evaluation.log import Traffic
 from teamslam.central.desk.evaluation.matching import Gospa, Matching
 from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
+from teamslam.central.desk.left_out import Span
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import contradicts, describe
 from teamslam.team.estimation.gaussian import Matrix
@@ -129,6 +130,7 @@ class RobotResult:
     smoothed: at submap ends, from the final map. aligned: after the rigid motion that aligns the
     map (`alignment`: "map"), or all smoothed paths ("paths"), or its own path ("trajectory").
     own_map: unaligned. outside: running poses are not in the team's frame.
+    left_out: spans without smoothed poses (`desk.left_out`).
     """
 
     consumption: Consumption
@@ -144,6 +146,7 @@ class RobotResult:
     online_aligned_rmse_m: float | None = None
     own_map: MapErrors | None = None
     outside: bool = False
+    left_out: tuple[Span, ...] = ()
 
     @property
     def final_pose_nees_per_dof(self) -> float | None:

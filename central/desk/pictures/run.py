@@ -183,8 +183,10 @@ def _draw_paths(
         x, y = float(known.poses[0, 0]), float(known.poses[0, 1])
         axis.plot(x, y, color=colour, linestyle="", marker="s", markersize=10, alpha=0.8, zorder=4)
     if len(smoothed.stamps_ns):
-        drawn = line.poses[:, :2] if dense is None else curve_through(line.poses)
-        axis.plot(*drawn.T, color=colour, linewidth=1.1, alpha=0.8, zorder=2)
+        ends = np.array([end for _, end in robot.left_out], np.int64)
+        for part in np.split(line.poses, np.searchsorted(line.stamps_ns, ends)):
+            drawn = part[:, :2] if dense is None else curve_through(part)
+            axis.plot(*drawn.T, color=colour, linewidth=1.1, alpha=0.8, zorder=2)
         axis.plot(
             *smoothed.poses.T[:2], color=colour, linestyle="", marker="o", markersize=3.5, zorder=3
         )
