@@ -58,7 +58,8 @@ def test_a_result_names_the_robot_with_a_late_clock_by_how_much_and_the_remedy(l
     assert abs(late_clock["value"] - LATE_S) < 3.0 * late_clock["sigma"] < 0.06
     text = late_clock["text"]
     assert text.startswith("r2's camera clock is 0.1")
-    assert f"add {late_clock['value']:.3g} to its clock_offset_s" in text
+    assert f"add {late_clock['value']:.3g} to its clock_offset_s, which moves its path" in text
+    assert f"subtract {late_clock['value']:.3g} s from the stamps of its detections" in text
     assert evaluation.warnings.count(text) == 1
     assert ("cause of misfit", text) in team_rows(evaluation)
 
