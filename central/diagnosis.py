@@ -71,8 +71,8 @@ DOUBTFUL_SCALE = 10.0
 MOST_SCALE = 100.0
 """Least covariance scale that no noise explains: sigmas ten times too small."""
 _CLOCK = (
-    "add {value:.3g} to its clock_offset_s, which moves its path to the camera's clock, or, to keep "
-    "the team's clock, subtract {value:.3g} s from the stamps of its detections"
+    "add {value:.3g} to its clock_offset_s, which moves its path to the camera's clock, or, to "
+    "keep the team's clock, subtract {value:.3g} s from the stamps of its detections"
 )
 _ERRORS: Mapping[str, _SharedError] = {
     "clock_offset": _SharedError(
