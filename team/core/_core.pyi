@@ -69,7 +69,7 @@ def check_blocks(data: bytes, count: int, what: str) -> None:
 
 class Consensus:
     """
-    The measurements of a window, and which of them agree: those that no others confirm are outliers.
+    The measurements of a window, and which of them agree: a measurement that no others confirm is an outlier.
 
     A measurement is accepted where it is likelier given the other accepted ones and the odometry than
     as an outlier, uniform over the sensor's range and field of view.
@@ -82,7 +82,7 @@ class Consensus:
 
     def add(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> None:
         """
-        Take a keyframe: the motion since the last one, then its measurements (there may be none).
+        Add a keyframe: the motion since the last one, then its measurements, if any.
         """
 
     def agreeing(self) -> NDArray[numpy.bool_]:
@@ -104,26 +104,26 @@ def product(a: NDArray[numpy.float64], b: NDArray[numpy.float64]) -> NDArray[num
     """
     Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.
 
-    Raises ValueError where A has not as many columns as B has rows.
+    Raises ValueError unless A has as many columns as B has rows.
     """
 
 def solve(A: NDArray[numpy.float64], B: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.
 
-    Raises LinAlgError where A is singular.
+    Raises LinAlgError if A is singular.
     """
 
 def inverse_matrix(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
-    Invert a matrix or each of a stack. Raises LinAlgError where one is singular.
+    Invert a matrix or each of a stack. Raises LinAlgError if one is singular.
     """
 
 def cholesky(A: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
     Compute the lower L with L L^T = A from the lower triangle of A.
 
-    Raises LinAlgError where A is not positive definite.
+    Raises LinAlgError unless A is positive definite.
     """
 
 def inverse_of_factored(L: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
@@ -162,9 +162,7 @@ def unpacked(triangle: NDArray[numpy.float64], n: int) -> NDArray[numpy.float64]
     """Expand a packed upper triangle to a symmetric n x n matrix."""
 
 def largest(values: NDArray[numpy.float64]) -> float:
-    """
-    Find the largest size of a number: 0 of none, NaN where one is not a number.
-    """
+    """Find the largest absolute value: 0 of an empty array, NaN with a NaN."""
 
 def chi2_quantiles(below: float, above: float, dof: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
@@ -181,7 +179,7 @@ def chi2_scale(squares: NDArray[numpy.float64], dof: NDArray[numpy.float64], med
 @overload
 def sin_and_cos(angle: float) -> tuple[float, float]:
     """
-    Sine and cosine of an angle [rad], or of each of an array; NaN of what is not finite.
+    Sine and cosine of an angle [rad], or of each of an array; NaN unless finite.
     """
 
 @overload
@@ -189,60 +187,56 @@ def sin_and_cos(angle: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], 
 
 @overload
 def exp(x: float) -> float:
-    """
-    E to the power of x, or of each of an array; 0 below -745.2, infinite above 709.8.
-    """
+    """e^x, or of each of an array; 0 below -745.2, infinite above 709.8."""
 
 @overload
 def exp(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def sin(angle: float) -> float:
-    """The sine of an angle [rad], or of each of an array."""
+    """Sine of an angle [rad], or of each of an array."""
 
 @overload
 def sin(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def cos(angle: float) -> float:
-    """The cosine of an angle [rad], or of each of an array."""
+    """Cosine of an angle [rad], or of each of an array."""
 
 @overload
 def cos(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def tan(angle: float) -> float:
-    """The tangent of an angle [rad], or of each of an array."""
+    """Tangent of an angle [rad], or of each of an array."""
 
 @overload
 def tan(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def log(x: float) -> float:
-    """The natural logarithm of x, or of each of an array."""
+    """Natural logarithm of x, or of each of an array."""
 
 @overload
 def log(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def log1p(x: float) -> float:
-    """The logarithm of 1 + x, or of that of each of an array."""
+    """ln(1 + x); x may be an array."""
 
 @overload
 def log1p(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def expm1(x: float) -> float:
-    """E to the power of x, less 1; x may be an array."""
+    """e^x - 1; x may be an array."""
 
 @overload
 def expm1(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def squared(x: float) -> float:
-    """
-    The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.
-    """
+    """x x; x may be an array. (Python's `x**2` is the C library's `pow`.)"""
 
 @overload
 def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
@@ -250,7 +244,7 @@ def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 @overload
 def normal_below(x: float) -> float:
     """
-    The probability that a standard normal variable stays below x, to 1e-15; x may be an array.
+    Probability of a standard normal variable below x, to 1e-15; x may be an array.
     """
 
 @overload
@@ -258,14 +252,14 @@ def normal_below(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def wrapped(angle: float) -> float:
-    """The same direction in (-pi, pi]; angle may be an array."""
+    """Wrap an angle to (-pi, pi]; it may be an array."""
 
 @overload
 def wrapped(angle: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def atan2(y: float, x: float) -> float:
-    """The direction of (x, y) in [-pi, pi]; both may be arrays."""
+    """Direction of (x, y) in [-pi, pi]; both may be arrays."""
 
 @overload
 def atan2(y: NDArray[numpy.float64], x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
@@ -278,7 +272,7 @@ def atan2(y: float, x: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
 
 @overload
 def hypot(x: float, y: float) -> float:
-    """The length of (x, y); both may be arrays."""
+    """Length of (x, y); both may be arrays."""
 
 @overload
 def hypot(x: NDArray[numpy.float64], y: NDArray[numpy.float64]) -> NDArray[numpy.float64]: ...
@@ -296,7 +290,8 @@ class SubmapFactor:
     mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).
     sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with
     which the bias moves it, 0 or 1; -1 for none. curvature: ∂²mean/∂b², a row per bias.
-    is_measured: False for a saved map, whose errors belong to no range. A state is additive; `at` has the index in it of the first number of each member.
+    is_measured: False for a saved map, whose errors belong to no range. at: index in the state of the first
+    number of each member.
     """
 
     def __init__(self, mean: NDArray[numpy.float64], information: NDArray[numpy.float64], landmarks: NDArray[numpy.float64], sensitivity: NDArray[numpy.float64], range_power: NDArray[numpy.int64], is_measured: bool = True, curvature: NDArray[numpy.float64] | None = None) -> None: ...
@@ -344,11 +339,11 @@ class Quadratic:
 
     @property
     def at(self) -> NDArray[numpy.float64]:
-        """The linearisation point."""
+        """Linearisation point."""
 
     @property
     def headings(self) -> NDArray[numpy.bool_]:
-        """Which of its numbers are headings."""
+        """Marks of the headings."""
 
     @property
     def information(self) -> NDArray[numpy.float64]: ...
@@ -361,7 +356,7 @@ class Quadratic:
 
     def woken(self, places: NDArray[numpy.int64], nodes: NDArray[numpy.int64]) -> Quadratic:
         """
-        Turn some landmarks at rest, by ascending place, into nodes: exact, since the others at rest are conditioned on
+        Turn some landmarks at rest, by ascending place, into nodes; exact, since the others at rest are conditioned on
         them. Raises NotPositiveDefiniteError.
         """
 
@@ -383,7 +378,7 @@ class SubmapGraph:
     offset: of each node's first number in the state, and the state's length. fixed: nodes that are
     constants. submaps: (factor, nodes of its members). sightings: (observer's and teammate's node,
     measurement, information). priors: (nodes, mean, information, whether it is of one robot's bias).
-    Raises ValueError where a factor does not fit its nodes.
+    Raises ValueError for a factor that does not fit its nodes.
     """
 
     def __init__(self, offset: NDArray[numpy.int64], fixed: NDArray[numpy.bool_], submaps: Sequence[tuple[SubmapFactor, NDArray[numpy.int64]]], sightings: Sequence[tuple[int, int, NDArray[numpy.float64], NDArray[numpy.float64], NDArray[numpy.float64]]], priors: Sequence[tuple[NDArray[numpy.int64], NDArray[numpy.float64], NDArray[numpy.float64], bool]], condensed: Quadratic | None) -> None: ...
@@ -401,10 +396,10 @@ class SubmapGraph:
 
 class Estimate:
     """
-    A state of a graph, with the weights of the factors there, and its Gauss-Newton step.
+    A state of a graph, with the weights of the factors at it, and its Gauss-Newton step.
 
     scale, sighting_scale: widening of the gates of each submap and inter-robot measurement. submap_gate:
-    factor on the gates of submaps; landmark_gate: χ² of a landmark's. The arrays are in the graph's order. What is computed is kept.
+    factor on the gates of submaps; landmark_gate: χ² of a landmark's. Arrays are in the graph's order; results are cached.
     """
 
     def __init__(self, graph: SubmapGraph, state: NDArray[numpy.float64], scale: NDArray[numpy.float64], sighting_scale: NDArray[numpy.float64], robust: bool, submap_gate: float, landmark_gate: float, covariance_factor: float, joined_ranges: bool) -> None: ...
@@ -455,7 +450,7 @@ class Estimate:
 
     @property
     def cost(self) -> float:
-        """The minimised cost, at these robust scales."""
+        """Cost at these robust scales."""
 
     @property
     def normal_equations(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
@@ -469,15 +464,15 @@ class Estimate:
 
     @property
     def posterior(self) -> Cholesky:
-        """The Cholesky factor of A. Raises NotPositiveDefiniteError."""
+        """Cholesky factor of A. Raises NotPositiveDefiniteError."""
 
     @property
     def step(self) -> NDArray[numpy.float64]:
-        """The full step, -A⁻¹g."""
+        """Full step, -A⁻¹g."""
 
     @property
     def squared_length(self) -> float:
-        """The full step's squared length in standard deviations, gᵀA⁻¹g."""
+        """Squared length of the full step in standard deviations, gᵀA⁻¹g."""
 
     @property
     def selected_covariance(self) -> NDArray[numpy.float64]:
@@ -488,8 +483,8 @@ class Estimate:
     def take_step(self, damping: float, halvings: int, most_damping: float) -> tuple[NDArray[numpy.float64] | None, float, float]:
         """
         Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on; else a
-        more damped one, up to most_damping. Returns the next state, the next damping and the full step's largest change; where no damping
-        helps the state is None, the damping infinite and the change that of the first step.
+        more damped one, up to most_damping. Returns the next state, the next damping and the full step's largest
+        change; if no damping helps, None, infinity and the change of the first step.
         """
 
     @property
@@ -539,7 +534,7 @@ class Estimate:
 
 class WholeMap:
     """
-    N(mean, covariance) of (pose, landmarks by ascending id) in one frame; it does not change.
+    N(mean, covariance) of (pose, landmarks by ascending id) in one frame; immutable.
     """
 
     def __init__(self, ids: NDArray[numpy.uint32], mean: NDArray[numpy.float64], covariance: NDArray[numpy.float64]) -> None: ...
@@ -606,7 +601,7 @@ class Chain:
         """
 
 class ChainSolution:
-    """The least-squares solution of a prior and the submaps after it."""
+    """Least-squares solution of a prior and the submaps after it."""
 
     @property
     def map(self) -> WholeMap:
@@ -631,18 +626,14 @@ class ChainSolution:
 
     @property
     def fault(self) -> int:
-        """
-        0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.
-        """
+        """0; 1 if an unknown is undetermined, 2 if map `at` has no covariance."""
 
     @property
     def at(self) -> int:
         """The map without covariance; 0 is the prior."""
 
 class Calibration:
-    """
-    Correction of a raw measurement of range and bearing, and the limits beyond which it is refused.
-    """
+    """Correction of a raw measurement of range and bearing, and its limits."""
 
     def __init__(self, range_offset: float, range_scale: float, bearing_offset: float, lens: Sequence[float] | None, optical_axis: float | None, ranges: Sequence[float], half_field: float) -> None:
         """
@@ -681,14 +672,14 @@ def located(pose: NDArray[numpy.float64], range: float, bearing: float) -> NDArr
 
 def place(pose: NDArray[numpy.float64], measurements: NDArray[numpy.float64], noise: Sequence[float], own: NDArray[numpy.float64]) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
     """
-    Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).
+    Initialise landmarks: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).
 
-    noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.
+    noise: as of `Window`; own: (n, 4) covariances of the measurements, or (n, 0).
     """
 
 class MotionModel:
     """
-    The parameters of a motion model, as of `teamslam.team.config.MotionModel`.
+    Parameters of a motion model, as of `teamslam.team.config.MotionModel`.
     """
 
     def __init__(self, *, turns_first: bool, forward: Sequence[float], turn: Sequence[float], final_turn: Sequence[float], lateral: Sequence[float], forward_scale: float, yaw_scale: float, yaw_rate_limit: float, turn_drag: float, veer: float, slow_below: float, slow_scale: float, covariance_factor: float, calibrated_speed: Sequence[float] | None, alphas: Sequence[float] | None, alpha_interval_s: float, wheels: Sequence[float] | None, shares: Sequence[float] | None, shares_interval_s: float) -> None:
@@ -779,7 +770,7 @@ def between(a_from_b: NDArray[numpy.float64], a_from_c: NDArray[numpy.float64]) 
     """b_from_c = a_from_b^-1 o a_from_c: the motion from b to c, seen in b."""
 
 def transformed(a_from_b: NDArray[numpy.float64], point_in_b: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
-    """The point's coordinates in frame a."""
+    """Return the point's coordinates in frame a."""
 
 def exponential(xi: NDArray[numpy.float64]) -> NDArray[numpy.float64]:
     """
@@ -965,7 +956,7 @@ def landmarks_along_paths(ids: NDArray[numpy.uint32], means: NDArray[numpy.float
 
 def normalised_square(error: NDArray[numpy.float64], S: NDArray[numpy.float64]) -> float:
     """
-    Compute e' inv(S) e by the Cholesky factor of S; NaN where a pivot is not above rounding.
+    Compute e' inv(S) e by the Cholesky factor of S; NaN if a pivot is not above rounding.
     """
 
 class Step:
@@ -1008,19 +999,19 @@ class Window:
 
     def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], random: Random, shift: NDArray[numpy.float64] | None = None) -> Step:
         """
-        Take a keyframe: the motion since the last one, then its measurements (there may be none).
+        Add a keyframe: the motion since the last one, then its measurements, if any.
 
-        own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are
-        resampled first where too few are effective. random: a uniform number is drawn where they are, then three
-        normal ones for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the
-        scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window as it was.
+        own: (n, 4) covariances of the measurements, or (n, 0). The particles are
+        resampled first if too few are effective. random: draws a uniform number for that, then three normal ones
+        for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the
+        scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window unchanged.
         """
 
     def step(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> float:
         """
-        Take a keyframe as `advance` does, without resampling and innovation; returns the log evidence.
+        Add a keyframe as `advance` does, without resampling and innovation; returns the log evidence.
 
-        Raises MotionError, and leaves the window as it was.
+        Raises MotionError, and leaves the window unchanged.
         """
 
     def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], random: Random, shift: NDArray[numpy.float64] | None = None) -> None:
@@ -1101,12 +1092,12 @@ class Window:
 
     def measurements(self) -> tuple[NDArray[numpy.int64], NDArray[numpy.uint32], NDArray[numpy.float64], NDArray[numpy.float64]]:
         """
-        Copy the measurements: keyframes (N,), ids (N,), (range, bearing) (N, 2), and the covariances that they
-        bring (N, 4), or (N, 0) where they bring none.
+        Copy the measurements: keyframes (N,), ids (N,), (range, bearing) (N, 2), and their own covariances
+        (N, 4), or (N, 0).
         """
 
     def ids(self) -> NDArray[numpy.uint32]:
-        """Copy the landmarks' numbers in order of first sight."""
+        """Copy the landmarks' numbers in order of first observation."""
 
     def nodes(self) -> NDArray[numpy.int64]:
         """Copy the keyframe of each pose node."""
@@ -1135,7 +1126,7 @@ class Scan:
 
     def __init__(self, ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64] | None = None) -> None:
         """
-        own: (n, 4) covariances that the measurements bring, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.
+        own: (n, 4) covariances of the measurements, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.
         """
 
     @staticmethod
@@ -1167,9 +1158,7 @@ class Scan:
 
     @property
     def own(self) -> NDArray[numpy.float64]:
-        """
-        Covariances (n, 4) that the measurements bring, (n, 0) where they bring none.
-        """
+        """Covariances (n, 4) of the measurements, or (n, 0)."""
 
     @property
     def is_unnamed(self) -> bool:
@@ -1182,7 +1171,7 @@ class Scan:
 
     def together(self, more: Scan) -> Scan:
         """
-        Append further measurements; where only one part brings covariances, the others have the sensor's noise.
+        Append further measurements; if only one part has covariances, the others have the sensor's noise.
         """
 
 def reduce_scans(scans: Sequence[Scan], poses: NDArray[numpy.float64]) -> Scan:
@@ -1190,7 +1179,7 @@ def reduce_scans(scans: Sequence[Scan], poses: NDArray[numpy.float64]) -> Scan:
     Reduce scans to one measurement per landmark, by ascending id.
 
     poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,
-    moved to the keyframe's end; its covariance is the mean of those that its measurements bring.
+    moved to the keyframe's end; its covariance is the mean of those of its measurements.
     """
 
 class TimedScan:
@@ -1279,25 +1268,25 @@ class Segmenter:
 
     With keyframe_ns = 0 every scan is a keyframe. Otherwise the scans within keyframe_ns are reduced to the
     median range and bearing per landmark, moved by the odometry to the end of the interval that closes the
-    keyframe. Each pose node is a keyframe without measurements. Scans without identities are kept until the
+    keyframe. Each pose node is a keyframe without measurements. Scans without identities are stored until the
     window's end. Motions are the sensor's; those since a pose node and an inter-robot measurement are the base's.
     A verdict is an index of `teamslam.team.rejection.BY_CORE`.
     """
 
     def __init__(self, model: MotionModel, mount: NDArray[numpy.float64] | None, calibration: Calibration, covariance_factor: float, keyframe_ns: int, window_ns: int, bounds: StreamBounds) -> None:
         """
-        mount: the sensor's pose on the base; None where it is at the base's origin. covariance_factor: on the
-        covariances that measurements bring. window_ns: planned length of a window.
+        mount: the sensor's pose on the base; None at the base's origin. covariance_factor: on the
+        measurements' own covariances. window_ns: planned length of a window.
         """
 
     def begin(self, stamp_ns: int) -> None:
         """Begin a stream or a window at this team time."""
 
     def resume(self, stamp_ns: int) -> None:
-        """Begin behind a window whose odometry ended at this team time."""
+        """Begin after a window whose odometry ended at this team time."""
 
     def observe(self, stamp_ns: int, scan: Scan) -> int:
-        """Keep a scan until the odometry covers its time; return the verdict."""
+        """Store a scan until the odometry covers its time; return the verdict."""
 
     @overload
     def drive(self, end_ns: int, duration_ns: int, forward: float, yaw_rate: float) -> int: ...
@@ -1337,7 +1326,7 @@ class Segmenter:
 
     def leave(self) -> int:
         """
-        Drop the scans stamped behind the window; return their number.
+        Drop the scans stamped after the window; return their number.
 
         Their counters lie in the window's interval of measurements: a robot restarted behind it would lack them.
         """
@@ -1346,11 +1335,11 @@ class Segmenter:
         """Mark an inter-robot measurement here, for the next pose node."""
 
     def since_node(self) -> tuple[NDArray[numpy.float64], NDArray[numpy.float64]]:
-        """The motion since the last pose node."""
+        """Return the motion since the last pose node."""
 
     def reach_node(self) -> list[tuple[NDArray[numpy.float64], NDArray[numpy.float64]]]:
         """
-        Make the stop a pose node; return the motions since the marked sightings, and forget these.
+        Make the stop a pose node; return the motions since the marked sightings, and clear these.
         """
 
     @property
@@ -1366,7 +1355,7 @@ class Segmenter:
 
     @property
     def uncovered(self) -> int:
-        """Number of scans that wait for odometry to cover their time."""
+        """Number of scans whose time odometry has not covered."""
 
     @property
     def start_ns(self) -> int | None:
@@ -1397,13 +1386,13 @@ class OpenWindow:
 
     def advance(self, keyframe: Keyframe) -> None:
         """
-        Take a keyframe with those of its measurements that agree with others of the window so far.
+        Add a keyframe with those of its measurements that agree with others of the window so far.
 
         If a measurement that was accepted before no longer agrees, the window is computed again.
         """
 
     def advance_by(self, segmenter: Segmenter) -> None:
-        """Take the keyframes that a segmenter has made."""
+        """Add the keyframes that a segmenter has made."""
 
     def move(self, rest: Keyframe) -> None:
         """Move the particles by the motion after the last keyframe."""

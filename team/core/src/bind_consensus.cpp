@@ -10,7 +10,7 @@ using window::Consensus;
 
 void bind_consensus(nb::module_& m) {
   nb::class_<Consensus>(m, "Consensus",
-                        "The measurements of a window, and which of them agree: those that no others confirm are outliers.\n\n"
+                        "The measurements of a window, and which of them agree: a measurement that no others confirm is an outlier.\n\n"
                         "A measurement is accepted where it is likelier given the other accepted ones and the odometry than\n"
                         "as an outlier, uniform over the sensor's range and field of view.")
       .def(
@@ -27,7 +27,7 @@ void bind_consensus(nb::module_& m) {
             self.add({motion, covariance}, scan_of(ids, ranges, bearings, own));
           },
           "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
-          "Take a keyframe: the motion since the last one, then its measurements (there may be none).")
+          "Add a keyframe: the motion since the last one, then its measurements, if any.")
       .def("agreeing", &Consensus::agreeing,
            "Mark the measurements that agree with others of their landmark under the odometry alone.\n\n"
            "The measurement of a landmark that the others support best places it; it is accepted together with\n"

@@ -94,10 +94,10 @@ MadeArray solve(const Array& A, const Array& B) {
 void bind_dense(nb::module_& m) {
   m.def("product", product, "a"_a, "b"_a,
         "Compute A B of matrices, vectors or stacks of them, as NumPy's `matmul`.\n\n"
-        "Raises ValueError where A has not as many columns as B has rows.");
+        "Raises ValueError unless A has as many columns as B has rows.");
   m.def("solve", solve, "A"_a, "B"_a,
         "Solve A^-1 B by elimination with partial pivoting; B is a vector, a matrix or a stack of these.\n\n"
-        "Raises LinAlgError where A is singular.");
+        "Raises LinAlgError if A is singular.");
   m.def(
       "inverse_matrix",
       [](const Array& A) {
@@ -112,7 +112,7 @@ void bind_dense(nb::module_& m) {
         }
         return made_array(std::move(inverses), axes_of(A));
       },
-      "A"_a, "Invert a matrix or each of a stack. Raises LinAlgError where one is singular.");
+      "A"_a, "Invert a matrix or each of a stack. Raises LinAlgError if one is singular.");
   m.def(
       "cholesky",
       [](const Array& A) {
@@ -122,7 +122,7 @@ void bind_dense(nb::module_& m) {
       },
       "A"_a,
       "Compute the lower L with L L^T = A from the lower triangle of A.\n\n"
-      "Raises LinAlgError where A is not positive definite.");
+      "Raises LinAlgError unless A is positive definite.");
   m.def(
       "inverse_of_factored", [](const Array& L) { return dense::inverse_from_factor(square(L)); }, "L"_a,
       "Compute (L L^T)^-1 of a lower triangular L, exactly symmetric.");
@@ -206,7 +206,7 @@ void bind_dense(nb::module_& m) {
         }
         return most;
       },
-      "values"_a, "Find the largest size of a number: 0 of none, NaN where one is not a number.");
+      "values"_a, "Find the largest absolute value: 0 of an empty array, NaN with a NaN.");
   m.def(
       "chi2_quantiles",
       [](double below, double above, std::vector<double> dof) {

@@ -84,10 +84,10 @@ void bind_elementary(nb::module_& m) {
         const auto [s, c] = elementary::sin_cos(angle.value);
         return std::tuple(s, c);
       },
-      "angle"_a, "Sine and cosine of an angle [rad], or of each of an array; NaN of what is not finite.");
+      "angle"_a, "Sine and cosine of an angle [rad], or of each of an array; NaN unless finite.");
   m.def("sin_and_cos", sines_and_cosines, "angle"_a);
   m.def("exp", [](const Number& x) { return elementary::exp(x.value); }, "x"_a,
-        "E to the power of x, or of each of an array; 0 below -745.2, infinite above 709.8.");
+        "e^x, or of each of an array; 0 below -745.2, infinite above 709.8.");
   m.def(
       "exp",
       [](const Array& x) {
@@ -96,21 +96,21 @@ void bind_elementary(nb::module_& m) {
         return made_array(std::move(powers), axes_of(x));
       },
       "x"_a);
-  def_of_one<elementary::sin>(m, "sin", "angle", "The sine of an angle [rad], or of each of an array.");
-  def_of_one<elementary::cos>(m, "cos", "angle", "The cosine of an angle [rad], or of each of an array.");
-  def_of_one<elementary::tan>(m, "tan", "angle", "The tangent of an angle [rad], or of each of an array.");
-  def_of_one<elementary::log>(m, "log", "x", "The natural logarithm of x, or of each of an array.");
-  def_of_one<elementary::log1p>(m, "log1p", "x", "The logarithm of 1 + x, or of that of each of an array.");
-  def_of_one<elementary::expm1>(m, "expm1", "x", "E to the power of x, less 1; x may be an array.");
+  def_of_one<elementary::sin>(m, "sin", "angle", "Sine of an angle [rad], or of each of an array.");
+  def_of_one<elementary::cos>(m, "cos", "angle", "Cosine of an angle [rad], or of each of an array.");
+  def_of_one<elementary::tan>(m, "tan", "angle", "Tangent of an angle [rad], or of each of an array.");
+  def_of_one<elementary::log>(m, "log", "x", "Natural logarithm of x, or of each of an array.");
+  def_of_one<elementary::log1p>(m, "log1p", "x", "ln(1 + x); x may be an array.");
+  def_of_one<elementary::expm1>(m, "expm1", "x", "e^x - 1; x may be an array.");
   m.def("squared", [](const Number& x) { return x.value * x.value; }, "x"_a,
-        "The square of x, or of each of an array: Python's `x**2` is the C library's `pow`.");
+        "x x; x may be an array. (Python's `x**2` is the C library's `pow`.)");
   m.def("squared", [](const Array::Any& x) { return nb::cast(x) * nb::cast(x); }, "x"_a,
         nb::sig("def squared(x: NDArray[numpy.float64]) -> NDArray[numpy.float64]"));
   def_of_one<elementary::normal_below>(m, "normal_below", "x",
-             "The probability that a standard normal variable stays below x, to 1e-15; x may be an array.");
-  def_of_one<se2::wrapped<double>>(m, "wrapped", "angle", "The same direction in (-pi, pi]; angle may be an array.");
-  def_of_two<elementary::atan2>(m, "atan2", "y", "x", "The direction of (x, y) in [-pi, pi]; both may be arrays.");
-  def_of_two<elementary::hypot>(m, "hypot", "x", "y", "The length of (x, y); both may be arrays.");
+             "Probability of a standard normal variable below x, to 1e-15; x may be an array.");
+  def_of_one<se2::wrapped<double>>(m, "wrapped", "angle", "Wrap an angle to (-pi, pi]; it may be an array.");
+  def_of_two<elementary::atan2>(m, "atan2", "y", "x", "Direction of (x, y) in [-pi, pi]; both may be arrays.");
+  def_of_two<elementary::hypot>(m, "hypot", "x", "y", "Length of (x, y); both may be arrays.");
 }
 
 }  // namespace teamslam::binding

@@ -112,7 +112,8 @@ void bind_graph(nb::module_& m) {
                      "mean: of (poses, landmarks); information: P⁻¹; landmarks: each one's own covariance (xx, xy, yy).\n"
                      "sensitivity: ∂mean/∂b, a row per bias; range_power: of each, the power of a landmark's range with\n"
                      "which the bias moves it, 0 or 1; -1 for none. curvature: ∂²mean/∂b², a row per bias.\n"
-                     "is_measured: False for a saved map, whose errors belong to no range. A state is additive; `at` has the index in it of the first number of each member.")
+                     "is_measured: False for a saved map, whose errors belong to no range. at: index in the state of the first\n"
+                     "number of each member.")
       .def("__init__",
            [](Submap* self, const graph::Numbers& mean, const Matrix& information, const Matrix& landmarks,
               const Matrix& sensitivity, const std::vector<Index>& range_power, bool is_measured, const Rows& curvature) {
@@ -171,8 +172,8 @@ void bind_graph(nb::module_& m) {
            },
            "nodes"_a, "at"_a, "headings"_a, "information"_a, "slope"_a, "cost"_a)
       .def_ro("nodes", &Quadratic::nodes)
-      .def_ro("at", &Quadratic::at, "The linearisation point.")
-      .def_ro("headings", &Quadratic::is_heading, "Which of its numbers are headings.")
+      .def_ro("at", &Quadratic::at, "Linearisation point.")
+      .def_ro("headings", &Quadratic::is_heading, "Marks of the headings.")
       .def_ro("information", &Quadratic::information)
       .def_ro("slope", &Quadratic::slope)
       .def_ro("cost", &Quadratic::cost)
@@ -190,7 +191,7 @@ void bind_graph(nb::module_& m) {
              return std::move(*made);
            },
            "places"_a, "nodes"_a,
-           "Turn some landmarks at rest, by ascending place, into nodes: exact, since the others at rest are conditioned on\n"
+           "Turn some landmarks at rest, by ascending place, into nodes; exact, since the others at rest are conditioned on\n"
            "them. Raises NotPositiveDefiniteError.");
 
   m.def("scatter_of_landmarks",
@@ -218,7 +219,7 @@ void bind_graph(nb::module_& m) {
                     "offset: of each node's first number in the state, and the state's length. fixed: nodes that are\n"
                     "constants. submaps: (factor, nodes of its members). sightings: (observer's and teammate's node,\n"
                     "measurement, information). priors: (nodes, mean, information, whether it is of one robot's bias).\n"
-                    "Raises ValueError where a factor does not fit its nodes.")
+                    "Raises ValueError for a factor that does not fit its nodes.")
       .def(nb::new_(&made_graph), "offset"_a, "fixed"_a, "submaps"_a, "sightings"_a, "priors"_a, "condensed"_a.none())
       .def_prop_ro("pattern", [](const Graph& self) { return std::const_pointer_cast<sparse::Pattern>(self.pattern()); },
                    "Blocks of the normal equations, a variable per node, and their places in the factor.")
@@ -230,9 +231,9 @@ void bind_graph(nb::module_& m) {
            "Compute r_lᵀ (covariance_factor · P_ll)⁻¹ r_l of each landmark of each submap.");
 
   nb::class_<Estimate>(m, "Estimate",
-                       "A state of a graph, with the weights of the factors there, and its Gauss-Newton step.\n\n"
+                       "A state of a graph, with the weights of the factors at it, and its Gauss-Newton step.\n\n"
                        "scale, sighting_scale: widening of the gates of each submap and inter-robot measurement. submap_gate:\n"
-                       "factor on the gates of submaps; landmark_gate: χ² of a landmark's. The arrays are in the graph's order. What is computed is kept.")
+                       "factor on the gates of submaps; landmark_gate: χ² of a landmark's. Arrays are in the graph's order; results are cached.")
       .def("__init__",
            [](Estimate* self, std::shared_ptr<Graph> graph, const graph::Numbers& state, const graph::Numbers& scale,
               const graph::Numbers& sighting_scale, bool robust, double submap_gate, double landmark_gate,
@@ -255,18 +256,18 @@ void bind_graph(nb::module_& m) {
       .def_prop_ro("sighting_weights", &Estimate::sighting_weights, "Robust weight of each inter-robot measurement.")
       .def_prop_ro("prior_chi2", &Estimate::prior_chi2, "χ² of each prior.")
       .def_prop_ro("prior_weights", &Estimate::prior_weights, "Robust weight of each prior: below 1 only for a robot's own bias.")
-      .def_prop_ro("cost", &Estimate::cost, "The minimised cost, at these robust scales.")
+      .def_prop_ro("cost", &Estimate::cost, "Cost at these robust scales.")
       .def_prop_ro("normal_equations", &Estimate::normal_equations,
                    "A = Σ w JᵀP⁻¹J in the layout of the graph's pattern, and half the gradient, Σ w JᵀP⁻¹r.")
       .def_prop_ro("gradient", [](const Estimate& self) { return self.normal_equations().second; },
                    "Half the gradient, Σ w JᵀP⁻¹r.")
       .def_prop_ro("posterior",
                    [](const Estimate& self) { return std::const_pointer_cast<sparse::Cholesky>(self.posterior()); },
-                   "The Cholesky factor of A. Raises NotPositiveDefiniteError.")
-      .def_prop_ro("step", &Estimate::step, "The full step, -A⁻¹g.")
+                   "Cholesky factor of A. Raises NotPositiveDefiniteError.")
+      .def_prop_ro("step", &Estimate::step, "Full step, -A⁻¹g.")
       .def_prop_ro("squared_length",
                    [](const Estimate& self) { return -dense::inner(self.normal_equations().second, self.step()); },
-                   "The full step's squared length in standard deviations, gᵀA⁻¹g.")
+                   "Squared length of the full step in standard deviations, gᵀA⁻¹g.")
       .def_prop_ro("selected_covariance", &Estimate::selected_covariance,
                    "Entries of A⁻¹ in the layout of the graph's pattern; fixed nodes: identity.")
       .def("take_step",
@@ -279,8 +280,8 @@ void bind_graph(nb::module_& m) {
            },
            "damping"_a, "halvings"_a, "most_damping"_a,
            "Take the step -(A + damping · diag A)⁻¹g if it lowers the cost; else, if undamped, its half, and so on; else a\n"
-           "more damped one, up to most_damping. Returns the next state, the next damping and the full step's largest change; where no damping\n"
-           "helps the state is None, the damping infinite and the change that of the first step.")
+           "more damped one, up to most_damping. Returns the next state, the next damping and the full step's largest\n"
+           "change; if no damping helps, None, infinity and the change of the first step.")
       .def_prop_ro("explained", &Estimate::explained,
                    "tr(JᵀP⁻¹J Σ) of each submap: the part of its dimension that the solution absorbs.")
       .def_prop_ro("explained_by_sightings", &Estimate::explained_by_sightings, "tr(JᵀR⁻¹J Σ) of each inter-robot measurement.")

@@ -27,7 +27,7 @@ LocalMap bare_submap_of(const Ids& ids, const Numbers& mean, const Table& covari
 
 void bind_maps(nb::module_& m) {
   nb::class_<WholeMap>(m, "WholeMap",
-                       "N(mean, covariance) of (pose, landmarks by ascending id) in one frame; it does not change.")
+                       "N(mean, covariance) of (pose, landmarks by ascending id) in one frame; immutable.")
       .def("__init__",
            [](WholeMap* self, const Ids& ids, const Numbers& mean, const Table& covariance) {
              const LocalMap of = bare_submap_of(ids, mean, covariance);
@@ -107,7 +107,7 @@ void bind_maps(nb::module_& m) {
       .def("solve", &Chain::solve, "iterations"_a, "tolerance"_a,
            "Minimise the squares over all poses and landmarks by damped Gauss-Newton.\n\n"
            "tolerance: the largest change of a number, of an undamped step, at which the iterations stop.");
-  nb::class_<ChainSolution>(m, "ChainSolution", "The least-squares solution of a prior and the submaps after it.")
+  nb::class_<ChainSolution>(m, "ChainSolution", "Least-squares solution of a prior and the submaps after it.")
       .def_ro("map", &ChainSolution::map, "The last end pose and all landmarks.")
       .def_ro("cost", &ChainSolution::cost, "Chi-squared of all maps, in `dof` degrees of freedom.")
       .def_ro("dof", &ChainSolution::dof)
@@ -116,7 +116,7 @@ void bind_maps(nb::module_& m) {
       .def_ro("landmark_chi2", &ChainSolution::landmark_chi2,
               "Chi-squared of each landmark of the submaps by its own covariance.")
       .def_prop_ro("fault", [](const ChainSolution& self) { return int(self.fault); },
-                   "0; 1 where an unknown is undetermined, 2 where map `at` has no covariance.")
+                   "0; 1 if an unknown is undetermined, 2 if map `at` has no covariance.")
       .def_ro("at", &ChainSolution::at, "The map without covariance; 0 is the prior.");
 }
 

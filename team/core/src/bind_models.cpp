@@ -16,7 +16,7 @@ void append(std::vector<double>& to, const std::array<std::array<double, N>, 2>&
 }
 
 void bind_calibration(nb::module_& m) {
-  nb::class_<Calibration>(m, "Calibration", "Correction of a raw measurement of range and bearing, and the limits beyond which it is refused.")
+  nb::class_<Calibration>(m, "Calibration", "Correction of a raw measurement of range and bearing, and its limits.")
       .def(
           "__init__",
           [](Calibration* self, double range_offset, double range_scale, double bearing_offset,
@@ -103,8 +103,8 @@ void bind_models(nb::module_& m) {
                           made<double, nb::ndim<2>>(std::move(covariances), {n, 3}));
       },
       "pose"_a, "measurements"_a, "noise"_a, "own"_a,
-      "Place landmarks at first sight: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).\n\n"
-      "noise: as of `Window`; own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none.");
+      "Initialise landmarks: means (n, 2) and covariances (xx, xy, yy) (n, 3) of measurements (n, 2).\n\n"
+      "noise: as of `Window`; own: (n, 4) covariances of the measurements, or (n, 0).");
 }
 
 }  // namespace teamslam::binding

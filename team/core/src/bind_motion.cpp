@@ -13,7 +13,7 @@ using Covariance = const linalg::Matrix3&;
 using Three = std::array<double, 3>;
 
 void bind_model(nb::module_& m) {
-  nb::class_<Model>(m, "MotionModel", "The parameters of a motion model, as of `teamslam.team.config.MotionModel`.")
+  nb::class_<Model>(m, "MotionModel", "Parameters of a motion model, as of `teamslam.team.config.MotionModel`.")
       .def(
           "__init__",
           [](Model* self, bool turns_first, const Three& forward, const Three& turn, const Three& final_turn, const Three& lateral,

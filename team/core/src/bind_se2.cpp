@@ -28,7 +28,7 @@ void bind_se2(nb::module_& m) {
   m.def("inverse", se2::inverse, "a_from_b"_a, "b_from_a.");
   m.def("between", se2::between, "a_from_b"_a, "a_from_c"_a,
         "b_from_c = a_from_b^-1 o a_from_c: the motion from b to c, seen in b.");
-  m.def("transformed", se2::transformed, "a_from_b"_a, "point_in_b"_a, "The point's coordinates in frame a.");
+  m.def("transformed", se2::transformed, "a_from_b"_a, "point_in_b"_a, "Return the point's coordinates in frame a.");
   m.def("exponential", se2::exponential, "xi"_a,
         "Exp: R^3 -> SE(2), the motion at the constant twist xi = (forward, left, turn) for unit time.");
   m.def("logarithm", se2::logarithm, "pose"_a, "Log: SE(2) -> R^3, the inverse of `exponential` for |heading| < pi.");

@@ -91,7 +91,7 @@ void bind_scans(nb::module_& m) {
             new (self) Measurements(std::move(scan));
           },
           "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a = nb::none(),
-          "own: (n, 4) covariances that the measurements bring, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.")
+          "own: (n, 4) covariances of the measurements, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.")
       .def_static(
           "polar",
           [](const nb::bytes& ids, const nb::bytes& ranges, const nb::bytes& bearings, const nb::bytes& covariances) {
@@ -109,7 +109,7 @@ void bind_scans(nb::module_& m) {
       }, nb::rv_policy::move)
       .def_prop_ro("ranges", [](const Measurements& self) { return self.ranges; })
       .def_prop_ro("bearings", [](const Measurements& self) { return self.bearings; })
-      .def_prop_ro("own", &made_claims, "Covariances (n, 4) that the measurements bring, (n, 0) where they bring none.")
+      .def_prop_ro("own", &made_claims, "Covariances (n, 4) of the measurements, or (n, 0).")
       .def_prop_ro("is_unnamed", &Measurements::is_unnamed, "Whether the landmarks have no identities.")
       .def("__len__", &Measurements::size)
       .def(
@@ -120,7 +120,7 @@ void bind_scans(nb::module_& m) {
           },
           "taken"_a, "Select measurements.")
       .def("together", &Measurements::with, "more"_a,
-           "Append further measurements; where only one part brings covariances, the others have the sensor's noise.");
+           "Append further measurements; if only one part has covariances, the others have the sensor's noise.");
   m.def(
       "reduce_scans",
       [](const std::vector<Measurements>& scans, const Table& poses) {
@@ -138,7 +138,7 @@ void bind_scans(nb::module_& m) {
       "scans"_a, "poses"_a,
       "Reduce scans to one measurement per landmark, by ascending id.\n\n"
       "poses: (m, 3), of each scan relative to the keyframe's end. A measurement is the median of range and bearing,\n"
-      "moved to the keyframe's end; its covariance is the mean of those that its measurements bring.");
+      "moved to the keyframe's end; its covariance is the mean of those of its measurements.");
 
   nb::class_<TimedScan>(m, "TimedScan",
                         "A scan without identities, at at_ns: its stamp, or the start of the odometry that covers it.")
@@ -208,7 +208,7 @@ void bind_segmenter(nb::module_& m) {
                         "Integrates odometry between keyframes; an observation splits an interval.\n\n"
                         "With keyframe_ns = 0 every scan is a keyframe. Otherwise the scans within keyframe_ns are reduced to the\n"
                         "median range and bearing per landmark, moved by the odometry to the end of the interval that closes the\n"
-                        "keyframe. Each pose node is a keyframe without measurements. Scans without identities are kept until the\n"
+                        "keyframe. Each pose node is a keyframe without measurements. Scans without identities are stored until the\n"
                         "window's end. Motions are the sensor's; those since a pose node and an inter-robot measurement are the base's.\n"
                         "A verdict is an index of `teamslam.team.rejection.BY_CORE`.")
       .def(
@@ -218,16 +218,16 @@ void bind_segmenter(nb::module_& m) {
             new (self) Segmenter({model, mount, calibration, covariance_factor, keyframe_ns, window_ns, bounds});
           },
           "model"_a, "mount"_a.none(), "calibration"_a, "covariance_factor"_a, "keyframe_ns"_a, "window_ns"_a, "bounds"_a,
-          "mount: the sensor's pose on the base; None where it is at the base's origin. covariance_factor: on the\n"
-          "covariances that measurements bring. window_ns: planned length of a window.")
+          "mount: the sensor's pose on the base; None at the base's origin. covariance_factor: on the\n"
+          "measurements' own covariances. window_ns: planned length of a window.")
       .def("begin", [](Segmenter& self, Nanoseconds stamp_ns) { self.begin(checked_ns(stamp_ns)); }, "stamp_ns"_a,
            "Begin a stream or a window at this team time.")
       .def("resume", [](Segmenter& self, Nanoseconds stamp_ns) { self.resume(checked_ns(stamp_ns)); }, "stamp_ns"_a,
-           "Begin behind a window whose odometry ended at this team time.")
+           "Begin after a window whose odometry ended at this team time.")
       .def(
           "observe",
           [](Segmenter& self, Nanoseconds stamp_ns, const Measurements& scan) { return int(self.observe(checked_ns(stamp_ns), scan)); },
-          "stamp_ns"_a, "scan"_a, "Keep a scan until the odometry covers its time; return the verdict.")
+          "stamp_ns"_a, "scan"_a, "Store a scan until the odometry covers its time; return the verdict.")
       .def(
           "drive",
           [](Segmenter& self, Nanoseconds end_ns, Nanoseconds duration_ns, double forward, double yaw_rate) {
@@ -249,16 +249,16 @@ void bind_segmenter(nb::module_& m) {
       .def("cut", [](Segmenter& self, Nanoseconds stamp_ns) { return self.cut(checked_ns(stamp_ns)); }, "stamp_ns"_a,
            "Close the window: make its last keyframe; return the later motion, as a keyframe without measurements.")
       .def("leave", &Segmenter::leave,
-           "Drop the scans stamped behind the window; return their number.\n\n"
+           "Drop the scans stamped after the window; return their number.\n\n"
            "Their counters lie in the window's interval of measurements: a robot restarted behind it would lack them.")
       .def("mark_sighting", [](Segmenter& self) { self.odometry().mark_sighting(); }, "Mark an inter-robot measurement here, for the next pose node.")
-      .def("since_node", [](Segmenter& self) { return made_increment(self.odometry().since_node()); }, "The motion since the last pose node.")
+      .def("since_node", [](Segmenter& self) { return made_increment(self.odometry().since_node()); }, "Return the motion since the last pose node.")
       .def("reach_node", [](Segmenter& self) { return made_increments(self.reach_node()); },
-           "Make the stop a pose node; return the motions since the marked sightings, and forget these.")
+           "Make the stop a pose node; return the motions since the marked sightings, and clear these.")
       .def_prop_ro("is_stopped", &Segmenter::is_stopped, "Whether the odometry has stopped within the interval.")
       .def_prop_ro("interval", [](const Segmenter& self) { return self.interval(); }, "The present interval; of an unmeasured motion, with the last speeds.")
       .def_prop_ro("judge", &Segmenter::judge, nb::rv_policy::reference_internal)
-      .def_prop_ro("uncovered", &Segmenter::uncovered, "Number of scans that wait for odometry to cover their time.")
+      .def_prop_ro("uncovered", &Segmenter::uncovered, "Number of scans whose time odometry has not covered.")
       .def_prop_ro("start_ns", &Segmenter::start_ns, "Begin of the window; None before the stream's.")
       .def_prop_ro("now_ns", &Segmenter::now_ns, "End of the odometry; None before the stream's begin.")
       .def_prop_ro("driven_m", &Segmenter::driven_m, "Path length [m] since the window's start.")
@@ -281,14 +281,14 @@ void bind_segmenter(nb::module_& m) {
           "Open a window: arguments as of `Window` and `Consensus`. random: copied, where it is. most_landmarks: beyond them\n"
           "the farthest new landmarks of a keyframe are dropped.")
       .def("advance", &OpenWindow::advance, "keyframe"_a,
-           "Take a keyframe with those of its measurements that agree with others of the window so far.\n\n"
+           "Add a keyframe with those of its measurements that agree with others of the window so far.\n\n"
            "If a measurement that was accepted before no longer agrees, the window is computed again.")
       .def(
           "advance_by",
           [](OpenWindow& self, Segmenter& segmenter) {
             for (Keyframe& each : segmenter.take_keyframes()) self.advance(std::move(each));
           },
-          "segmenter"_a, "Take the keyframes that a segmenter has made.")
+          "segmenter"_a, "Add the keyframes that a segmenter has made.")
       .def("move", &OpenWindow::move, "rest"_a, "Move the particles by the motion after the last keyframe.")
       .def("confirm", &OpenWindow::confirm, "Compare all measurements of the window; return whether others are accepted now.")
       .def("accepted", nb::overload_cast<>(&OpenWindow::accepted, nb::const_), "Copy the keyframes with their accepted measurements.")

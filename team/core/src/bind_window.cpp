@@ -217,7 +217,7 @@ void bind_particles(nb::module_& m) {
         check(S.shape(0) == error.size() && S.shape(1) == error.size(), "S must be (m, m)");
         return linalg::normalised_square({error.data(), error.size()}, {S.data(), S.size()});
       },
-      "error"_a, "S"_a, "Compute e' inv(S) e by the Cholesky factor of S; NaN where a pivot is not above rounding.");
+      "error"_a, "S"_a, "Compute e' inv(S) e by the Cholesky factor of S; NaN if a pivot is not above rounding.");
 }
 
 }  // namespace
@@ -263,11 +263,11 @@ void bind_window(nb::module_& m) {
             return self.advance(increment_of(motion, covariance, shift), scan_of(ids, ranges, bearings, own), random);
           },
           "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "random"_a, "shift"_a = nb::none(),
-          "Take a keyframe: the motion since the last one, then its measurements (there may be none).\n\n"
-          "own: (n, 4) covariances that the measurements bring, (n, 0) where they bring none. The particles are\n"
-          "resampled first where too few are effective. random: a uniform number is drawn where they are, then three\n"
-          "normal ones for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the\n"
-          "scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window as it was.")
+          "Add a keyframe: the motion since the last one, then its measurements, if any.\n\n"
+          "own: (n, 4) covariances of the measurements, or (n, 0). The particles are\n"
+          "resampled first if too few are effective. random: draws a uniform number for that, then three normal ones\n"
+          "for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the\n"
+          "scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window unchanged.")
       .def(
           "step",
           [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
@@ -276,8 +276,8 @@ void bind_window(nb::module_& m) {
                              normals_of(normals, self.settings().particles));
           },
           "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "normals"_a,
-          "Take a keyframe as `advance` does, without resampling and innovation; returns the log evidence.\n\n"
-          "Raises MotionError, and leaves the window as it was.")
+          "Add a keyframe as `advance` does, without resampling and innovation; returns the log evidence.\n\n"
+          "Raises MotionError, and leaves the window unchanged.")
       .def(
           "move",
           [](Window& self, const Triple& motion, const Matrix3& covariance, random::Random& random,
@@ -409,15 +409,15 @@ void bind_window(nb::module_& m) {
                               made<double, nb::ndim<2>>(std::move(measurements), {n, 2}),
                               made<double, nb::ndim<2>>(std::move(own), {n, has_claims ? 4u : 0u}));
           },
-          "Copy the measurements: keyframes (N,), ids (N,), (range, bearing) (N, 2), and the covariances that they\n"
-          "bring (N, 4), or (N, 0) where they bring none.")
+          "Copy the measurements: keyframes (N,), ids (N,), (range, bearing) (N, 2), and their own covariances\n"
+          "(N, 4), or (N, 0).")
       .def(
           "ids",
           [](const Window& self) {
             const auto& ids = self.particles().ids;
             return made<std::uint32_t, nb::ndim<1>>(std::vector<std::uint32_t>(ids), {ids.size()});
           },
-          "Copy the landmarks' numbers in order of first sight.")
+          "Copy the landmarks' numbers in order of first observation.")
       .def(
           "nodes",
           [](const Window& self) {
