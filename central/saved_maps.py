@@ -31,9 +31,20 @@ days do not reduce it: the bias of their Gaussians, and of ranges whose scale is
 REMAINDER = 1e-3
 """Part of a prior that stays in the evidence about an error, which some map may not determine."""
 
+COUNTED_TWICE = "and count twice: use a map without them, or another day"
+"""End of the warning of `describe_repetition`."""
+
 
 class NothingToSaveError(ValueError):
     """A map that cannot be saved, with reason and remedy."""
+
+
+def describe_repetition(robot: str, saved: m.SavedMap) -> str:
+    """Describe that a robot's first submap of this day is in a saved map."""
+    return (
+        f"{robot}'s measurements of this day are in the saved map {saved.name} already, "
+        f"{COUNTED_TWICE}"
+    )
 
 
 def save_map(

@@ -4,7 +4,7 @@ The map is a pure function of the set (law 2).
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from teamslam.central import join_messages, localising, unnamed_landmarks
@@ -12,7 +12,12 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.diagnosis import describe, diagnose, widening
 from teamslam.central.fused_map import JOINT_LANDMARKS, receivable, version_entry
 from teamslam.central.monitor import monitor_figures
-from teamslam.central.saved_maps import NothingToSaveError, landmark_changes, save_map
+from teamslam.central.saved_maps import (
+    NothingToSaveError,
+    describe_repetition,
+    landmark_changes,
+    save_map,
+)
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.survey import datum_of
 from teamslam.central.tick_fold import TickFold
@@ -116,6 +121,9 @@ class SubmapFold:
         streams = sorted({whole_of(stream) for stream in main if not is_map(stream)})
         if not streams:
             raise NothingToSaveError("no robot has a submap in the final map")
+        repetitions = [*self._repetitions()]
+        if repetitions:
+            raise NothingToSaveError("; ".join(repetitions))
         firsts = list(map(self._digest_first, streams))
         datum = datum_of(self.config, fused, before.values())
         return save_map(fold, fused, name, before, firsts, datum)
@@ -176,21 +184,23 @@ class SubmapFold:
             "taken as no surer than that"
             for robot, count in self._ticks.inputs.raised(self._ticks.withdrawn).items()
         )
-        streams = [s for s in sorted(self.store.chains) if self.store.maps and not is_map(s)]
-        firsts = {stream: self._digest_first(stream) for stream in streams}
-        repeated = (
-            f"{robot}'s measurements of this day are in the saved map {saved.name} already, and "
-            "count twice: use a map without them, or another day"
-            for saved in self.store.maps.values()
-            for robot in sorted({s[0] for s, first in firsts.items() if first in saved.sets})
-        )
         undecided = [self._ticks.undecided] if self._ticks.undecided else []
         if self._apart:
             undecided.append(
                 f"{', '.join(self._apart)} contradict each other: until it is determined which of "
                 "them is wrong, each one's prior is made of its own submaps"
             )
-        return (*suspended, *undecided, *repeated, *raised, *self.reasons)
+        return (*suspended, *undecided, *self._repetitions(), *raised, *self.reasons)
+
+    def _repetitions(self) -> Iterator[str]:
+        """Describe the robots whose measurements count twice, by a saved map."""
+        gone, chains = self._ticks.withdrawn, self.store.chains
+        maps = [saved for saved in self.store.maps.values() if saved.author not in gone]
+        robots = [s for s in sorted(chains) if maps and not is_map(s) and s[0] not in gone]
+        firsts = {stream: self._digest_first(stream) for stream in robots}
+        for saved in maps:
+            for robot in sorted({s[0] for s, first in firsts.items() if first in saved.sets}):
+                yield describe_repetition(robot, saved)
 
     def _messages(
         self, ticks: TickFold, fold: Fold, tail: join_messages.Tail, recorded: RecordedFields | None

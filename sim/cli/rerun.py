@@ -187,7 +187,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     from teamslam.central.desk.evaluation.history import history
     from teamslam.central.desk.verification.recorded import RerunError
     from teamslam.sim.cli.importing import readable
-    from teamslam.sim.recorded.changed_run import Changes, changed_run
+    from teamslam.sim.recorded.changed_run import Changes, changed_run, check_days
     from teamslam.sim.recorded.world import DataSetRun, log_or_run
     from teamslam.team.recording.reader import Log
 
@@ -195,6 +195,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         log = log_or_run(source)
     if isinstance(log, Log):
         opt.warn_of_holes(log)
+    check_days(log, changes)
     recorded = evaluate(log.samples())
     with failing(RerunError, at=path):
         plain = isinstance(log, DataSetRun) and changes == Changes()

@@ -8,6 +8,7 @@ from typing import cast
 
 import msgspec
 
+from teamslam.central.saved_maps import describe_repetition
 from teamslam.sim.in_memory.team import Conditions, Partition, run_nodes
 from teamslam.sim.recorded.world import RecordedWorld, Samples
 from teamslam.sim.scenarios.checks import ScenarioError
@@ -22,7 +23,11 @@ from teamslam.team.config import (
 )
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.saved_map import read_map
-from teamslam.team.wire.bus import Sample
+from teamslam.team.wire import channels as ch
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Sample, try_open
+from teamslam.team.wire.codec import encoded
+from teamslam.team.wire.digest import digest_of
 
 Span = tuple[float, float]
 """Begin and end in seconds since the log's first measurement."""
@@ -62,6 +67,23 @@ def changed_run(log: Samples, changes: Changes) -> list[Sample]:
     world.load_maps(read_map(Path(path)) for path in changes.maps)
     conditions = _conditions(scenario, changes, world.first_ns)
     return list(run_nodes(scenario, world, conditions))
+
+
+def check_days(log: Samples, changes: Changes) -> None:
+    """Refuse maps that contain the log's measurements already; raises ScenarioError."""
+    if changes.localise:
+        return
+    maps = [read_map(Path(path)) for path in changes.maps]
+    found = set[str]()
+    for sample in log.samples([ch.SUBMAP]) if maps else ():
+        message = try_open(sample)
+        submap = None if message is None else message[2]
+        if not isinstance(submap, m.Submap) or submap.sequence or submap.robot in changes.without:
+            continue
+        first = digest_of(encoded(submap))
+        found |= {describe_repetition(submap.robot, each) for each in maps if first in each.sets}
+    if found:
+        raise ScenarioError("; ".join(sorted(found)))
 
 
 def _changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:

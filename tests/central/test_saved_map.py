@@ -8,13 +8,14 @@ import pytest
 from click.testing import CliRunner
 
 from teamslam.central import saved_maps
+from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.verification.centre import recorded_map
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.central.saved_maps import NothingToSaveError, save_map
 from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.scenario import ScenarioError, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.core import unpacked
@@ -113,16 +114,27 @@ def test_without_a_known_start_the_teams_frame_is_that_of_the_saved_map():
 
 
 @pytest.mark.parametrize("localise", [False, True])
-def test_a_day_that_the_map_contains_is_named_and_gives_no_advice_about_sigmas(localise):
+def test_a_day_that_the_map_contains_fails_and_gives_no_advice_about_sigmas(tmp_path, localise):
     scenario = final_only(with_options(load("thesis-b"), seed=1, localise=localise))
     saved = first_day()[1]
-    _, centre, _ = day(1, [saved], scenario=scenario, streams=streams_of(scenario))
+    samples, centre, _ = day(1, [saved], scenario=scenario, streams=streams_of(scenario))
     said = "; ".join(centre.findings)
+    failures = [each for each in evaluate(samples).failures if "count twice" in each]
+    assert len(failures) == (0 if localise else 2)
     for robot in ("r1", "r2"):
         assert f"{robot}'s measurements of this day are in the saved map site already" in said
     assert "map-site: the submaps' covariances are too large" in said
     assert "sigmas" not in said
     assert "already" not in "; ".join(second_day()[1].findings)
+    if localise:
+        return
+    log = tmp_path / "log.mcap"
+    with Recorder(log, "small", {"seed": "1"}) as recorder:
+        recorder.write(samples)
+    save = CliRunner().invoke(app, ["map", "save", str(log), "-o", str(tmp_path / "twice.map")])
+    assert save.exit_code == 1
+    assert "r1's measurements of this day are in the saved map site already" in save.output
+    assert not (tmp_path / "twice.map").exists()
 
 
 @pytest.mark.parametrize("moved", [((15, (0.5, 0.0)),), tuple((k, (3.0, 2.0)) for k in (2, 8, 11))])
@@ -463,6 +475,11 @@ def test_the_commands_save_show_and_load_a_map(tmp_path):
     changes = json.loads((tmp_path / "x.json").read_text())["recomputed"]["changes"]
     assert [each["state"] for each in changes] == ["unchanged"] * 18
     assert {"landmark", "state", "dx_m", "dy_m", "sigma_m", "chi2"} <= changes[0].keys()
+    for changed in ([], ["--window", "8"]):
+        twice = run(app, ["rerun", str(log), "--map", str(site), *changed])
+        assert isinstance(twice.exception, ScenarioError)  # status 2 of the program
+        assert "r1's measurements of this day are in the saved map site" in str(twice.exception)
+        assert "recorded" not in twice.output
     for words in (["map", "show", str(log)], ["rerun", str(log), "--map", str(log)]):
         wrong = run(app, words)
         assert wrong.exit_code == 2

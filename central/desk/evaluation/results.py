@@ -16,6 +16,7 @@ from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not
 from teamslam.central.desk.left_out import Span
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import contradicts, describe
+from teamslam.central.saved_maps import COUNTED_TWICE
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
@@ -237,13 +238,14 @@ class Evaluation:
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """Missing robots, and wrong measurements in the map: mirrored, or contradicting."""
+        """Missing robots, and wrong measurements in the map: twice, mirrored, or contradicting."""
         of_map = () if self.map is None else self.map.diagnosis
         if not any(contradicts(each) and not each.robot for each in of_map):
-            return (*self.missing, *self._mirrored_in_the_map)
+            return (*self.missing, *self._repetitions, *self._mirrored_in_the_map)
         causes = "; ".join(map(describe, self.diagnosis))
         return (
             *self.missing,
+            *self._repetitions,
             "the measurements contradict each other far beyond the stated noise, so the map is not "
             f"to be used: {causes}",
         )
@@ -256,6 +258,13 @@ class Evaluation:
             for each in self.diagnosis
             if each.cause == "mirrored" and each.robot in inside
         )
+
+    @property
+    def _repetitions(self) -> tuple[str, ...]:
+        """Robots whose measurements a saved map contains already, unless they are localised."""
+        reasons = () if self.map is None else self.map.reasons
+        localised = self.scenario is not None and self.scenario.central.localise
+        return tuple(each for each in reasons if not localised and each.endswith(COUNTED_TWICE))
 
     @property
     def other_warnings(self) -> tuple[str, ...]:
