@@ -1,6 +1,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +13,12 @@ from teamslam.sim.cli.main import load_all
 from teamslam.sim.importing.columns import load_map
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
+from teamslam.team.config import MotionNoise
 from teamslam.team.ros2.topics import load_topics
 from tests.commands import output_of
 
 ROOT = Path(__file__).parents[3]
+BUILTIN = ROOT / "sim" / "scenarios" / "builtin"
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -67,7 +70,7 @@ def test_the_data_set_of_the_page_is_read(tmp_path, monkeypatch):
 
 def test_the_scenario_and_the_map_of_the_page_are_sound(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    clock, columns, further, robots, mixed, own = blocks("your_data.md", "toml")
+    _, columns, further, robots, mixed, own = blocks("your_data.md", "toml")
     (tmp_path / "columns.toml").write_text(columns)
     assert set(load_map(tmp_path / "columns.toml").shared) == {"odometry", "observations"}
     (tmp_path / "further.toml").write_text(further)
@@ -81,7 +84,27 @@ def test_the_scenario_and_the_map_of_the_page_are_sound(tmp_path, monkeypatch):
     (tmp_path / "my_set" / "scenario.toml").write_text(own)
     scenario = load(scenario_beside("my_set"))
     assert [robot.id for robot in scenario.robots] == ["r1", "r2"]
-    assert scenario.robots[0].sensor.bearing_sigma == 0.02
+    sensor, motion = scenario.robots[0].sensor, scenario.robots[0].motion
+    assert (sensor.range_sigma, sensor.range_sigma_per_m) == (0.05, 0.0)
+    assert sensor.bearing_sigma == 0.02
+    assert motion.forward == MotionNoise(per_m=0.02)
+    assert motion.turn == MotionNoise(per_s=0.004, per_rad=0.02)
+    assert motion.lateral == MotionNoise()
+
+
+def test_the_page_has_the_figures_of_the_built_in_scenario_that_merging_keeps():
+    noise = (ROOT / "docs" / "your_data.md").read_text("utf-8").partition("## Noise")[2]
+    built_in = tomllib.loads((BUILTIN / "recorded.toml").read_text("utf-8"))["defaults"]
+    per_m = built_in["sensor"]["range_sigma_per_m"]
+    stated = tomllib.loads("\n".join(re.findall(r"`((?:forward|turn|lateral) = {.*?})`", noise)))
+    assert stated == {name: built_in["motion"][name] for name in ("forward", "turn", "lateral")}
+    assert f"`range_sigma_per_m = {per_m}`" in noise
+
+
+def test_the_clock_of_the_page_is_added_to_its_scenario(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    clock, *_, own = blocks("your_data.md", "toml")
+    made("python examples/own_data.py my_set", tmp_path)
     (tmp_path / "my_set" / "scenario.toml").write_text(f"{own}\n{clock}")
     late = load(scenario_beside("my_set"))
     assert [robot.clock_offset_s for robot in late.robots] == [0.0, 0.12]
