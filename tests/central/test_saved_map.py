@@ -457,6 +457,15 @@ def test_a_landmark_without_identity_that_has_moved_is_found_and_nothing_else(nu
     assert (np.abs([found.dx - by[0], found.dy - by[1]]) < 4.0 * found.sigma).all()
 
 
+def test_a_landmark_without_identity_beyond_the_gate_is_gone_and_another_is_new():
+    scenario, streams = hidden(1001, [(15, (3.0, -1.5))])
+    profile = scenario.central.association
+    assert np.sqrt(profile.gate) * profile.slack < np.hypot(3.0, 1.5)
+    samples, _, _ = day(1, [hidden_site()], scenario=scenario, streams=streams)
+    states = sorted(each.state for each in changed(final_map(samples)).values())
+    assert states == ["gone", "new"]
+
+
 def test_the_commands_save_show_and_load_a_map(tmp_path):
     log, later, site = (tmp_path / name for name in ("log.mcap", "later.mcap", "site.map"))
     for path, samples in ((log, first_day()[0]), (later, second_day(loaded=False)[0])):
