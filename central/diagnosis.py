@@ -8,6 +8,7 @@ robot's submaps states of the map. The covariance scale is judged beside all acc
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,13 +21,16 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Contribution, Stream, moment, named, part_of
 from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, information
 from teamslam.team.estimation.map_joining import hypotheses, marginals
-from teamslam.team.estimation.map_joining.gauss_newton import joint_marginal
+from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import Fold
-from teamslam.team.estimation.se2 import Pose, wrapped
+from teamslam.team.estimation.se2 import Pose, compose, wrapped
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
 Values = Float[np.ndarray, " _"]
+Covariance = Float[np.ndarray, "3 3"]
+Spoilt = Mapping[Seam, Sequence[Contribution]]
+NO_SPOILT: Spoilt = MappingProxyType({})
 SIGMAS = 4.0
 """Least size of a shared error in its standard deviations."""
 NONLINEAR = 0.08
@@ -117,16 +121,17 @@ def diagnose(
     scale: float,
     *,
     final: bool,
+    spoilt: Spoilt = NO_SPOILT,
 ) -> tuple[m.Diagnosis, ...]:
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
     withdrawn: submaps of withdrawn robots. normal: the right covariance scale; scale: the team's,
-    or its cost per degree of freedom. final: see `find_misscaled`.
+    or its cost per degree of freedom. final: see `find_misscaled`. spoilt: see `cuts_of`.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
     shared = list(_shared_errors(fold, biases, scale))
-    found = [*shared, *_mirrored(fold, withdrawn), *cuts_of(fold)]
+    found = [*shared, *_mirrored(fold, withdrawn), *cuts_of(fold, spoilt)]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
     try:
@@ -156,10 +161,12 @@ def diagnose(
     return (*found, *noise)
 
 
-def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:
-    """Describe the cuts of a fold, where a robot was carried off or slipped, with the motion in the
-    map's frame (x [m], y [m], turn [rad]) where both parts are in one island.
+def cuts_of(fold: Fold, spoilt: Spoilt = NO_SPOILT) -> Iterator[m.Diagnosis]:
+    """Describe the cuts of a fold, where a robot was carried off or slipped, with the motion that
+    the odometry did not measure, in the map's frame (x [m], y [m], turn [rad]), where both parts
+    are in one island.
 
+    spoilt: submaps that a cut leaves out between the parts; their motion was measured.
     A part that lies where the odometry puts it was not carried off. With landmark names the fold
     makes no cut; a hypothesis names the jump.
     """
@@ -168,16 +175,22 @@ def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:
         island = fold.island(*cut.stream)
         place = island.state[island.graph.offset[island.graph.streams[cut.stream][-1]] :][:2]
         by: tuple[float, ...] = ()
+        sigma: tuple[float, ...] = ()
         if fold.home.get(later, later) == fold.home[cut.stream]:
-            gap, chi2 = _gap(fold, cut.stream, later)
-            if cut.after == cut.before + 1 and cost_share(chi2, SEAM_DOF, SUSPICION) <= 1.0:
+            between = spoilt.get(cut, ())
+            gap, spread = _gap(fold, cut.stream, later, between)
+            is_plain = cut.after == cut.before + 1
+            if is_plain and cost_share(_chi2(gap, spread), SEAM_DOF, SUSPICION) <= 1.0:
                 continue
-            if fold.island(*later).graph.first_sequence(later) == cut.after:
+            is_whole = len(between) == cut.after - cut.before - 1
+            if is_whole and fold.island(*later).graph.first_sequence(later) == cut.after:
                 by = (float(gap[0]), float(gap[1]), wrapped(gap[2]))
+                sigma = tuple(np.sqrt(np.maximum(np.diagonal(spread), 0.0)).tolist())
         yield m.Diagnosis(
             cause="carried_off",
             robot=cut.stream[0],
             value=by,
+            sigma=sigma,
             evidence=cut.evidence,
             remedy=REMEDY,
             at_ns=cut.begin_ns,
@@ -185,19 +198,35 @@ def cuts_of(fold: Fold) -> Iterator[m.Diagnosis]:
         )
 
 
-def _gap(fold: Fold, earlier: Stream, later: Stream) -> tuple[Pose, float]:
+def _gap(
+    fold: Fold, earlier: Stream, later: Stream, between: Sequence[Contribution]
+) -> tuple[Pose, Covariance]:
     island = fold.islands[fold.home[earlier]]
-    nodes = [island.graph.streams[earlier][-1], island.graph.streams[later][0]]
-    mean, covariance = joint_marginal(island, nodes)
-    gap = mean[3:] - mean[:3]
-    gap[2] = wrapped(gap[2])
-    J = np.hstack([-np.eye(3), np.eye(3)])
-    spread = dense.product(dense.product(J, covariance), J.T)
+    nodes = island.graph.streams[earlier][-1], island.graph.streams[later][0]
+    return hypotheses.motion_beyond(island, *nodes, *_motion_over(between))
+
+
+def _motion_over(submaps: Sequence[Contribution]) -> tuple[Pose, Covariance]:
+    """Compose the motion of consecutive submaps: pose and covariance in the frame of the start."""
+    pose, P = np.zeros(3), np.zeros((3, 3))
+    for each in submaps:
+        end, Q = each.local.end_pose, each.local.covariance[:3, :3]
+        after = compose(pose, end)
+        s, c = core.sin_and_cos(float(pose[2]))
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        F = np.eye(3)
+        F[0, 2], F[1, 2] = pose[1] - after[1], after[0] - pose[0]
+        P = dense.product(dense.product(F, P), F.T) + dense.product(dense.product(R, Q), R.T)
+        pose = after
+    return pose, P
+
+
+def _chi2(gap: Pose, spread: Covariance) -> float:
     try:
         metric = information(spread, "a seam")
     except NotACovarianceError:
-        return gap, math.inf
-    return gap, float(dense.product(dense.product(gap, metric), gap))
+        return math.inf
+    return float(dense.product(dense.product(gap, metric), gap))
 
 
 def _is_start(found: hypotheses.Hypothesis | m.Diagnosis) -> bool:

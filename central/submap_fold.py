@@ -220,7 +220,13 @@ class SubmapFold:
         shown = join_messages.shown_landmarks(fold, self.config, tail)
         withdrawn = ticks.submaps_of_withdrawn()
         self.diagnosis = diagnose(
-            fold, biases, withdrawn, self.config.normal_scale, scale, final=final
+            fold,
+            biases,
+            withdrawn,
+            self.config.normal_scale,
+            scale,
+            final=final,
+            spoilt=ticks.submaps_between_parts(fold),
         )
         self.reasons = join_messages.reasons(
             fold,

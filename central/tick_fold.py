@@ -410,6 +410,19 @@ class TickFold:
             for robot in self.withdrawn
         }
 
+    def submaps_between_parts(
+        self, fold: joining.Fold
+    ) -> Mapping[Seam, Sequence[contribution.Contribution]]:
+        """Return the submaps that each cut leaves out between the parts of its stream."""
+        found = {}
+        for cut in fold.cuts:
+            if cut.after == cut.before + 1:
+                continue
+            stream = contribution.whole_of(cut.stream)
+            chain = self.inputs.chains(stream[0]).get(stream, ())
+            found[cut] = [each for each in chain if cut.before < each.sequence < cut.after]
+        return found
+
     # The names of a fold.
 
     def digest(self, fold: joining.Fold, *more: bytes) -> bytes:

@@ -11,6 +11,7 @@ from teamslam.central.tick_fold import TickFold
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
+from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
@@ -70,10 +71,15 @@ def test_the_map_is_right_and_names_the_robot_the_time_and_the_motion(off):
     (found,) = said(final)
     inside = off is INSIDE
     assert (found.robot, found.at_ns) == ("r2", 100_000_000_000)
-    at = [int(np.abs(path[:, 0] - t).argmin()) for t in (AT_S - 0.1, AT_S + 10.0 * inside)]
-    before, after = path[at[0], 1:], path[at[1], 1:]
+    at_s = (AT_S - 0.1, off.at_s - 0.1, off.at_s, AT_S + 10.0 * inside)
+    before, there, put_down, after = (path[np.abs(path[:, 0] - t).argmin(), 1:] for t in at_s)
+    if inside:  # the window's own motion was measured
+        before = compose(before, compose(inverse(before), there))
+        before = compose(before, compose(inverse(put_down), after))
     x, y, turn = found.value
     assert math.hypot(*(np.array([x, y]) - (after - before)[:2])) < 1.0
+    assert len(found.sigma) == 3
+    assert 0.0 < max(found.sigma[:2]) < 1.0
     assert math.remainder(turn - (after - before)[2], 2 * math.pi) == pytest.approx(0.0, abs=0.15)
 
 

@@ -34,8 +34,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
 from teamslam.team.estimation.map_joining.marginals import scale_of, terms
 from teamslam.team.estimation.map_joining.splitting import resolved, robust, split, without
 from teamslam.team.estimation.map_joining.submap_graph import Graph
-from teamslam.team.estimation.se2 import compose, inverse, wrapped
-from teamslam.team.estimation.submap import LocalMap
+from teamslam.team.estimation.se2 import Pose, compose, inverse, wrapped
 from teamslam.team.shapes import Bool, Float, Int64
 
 Values = Float[np.ndarray, " _"]
@@ -353,7 +352,8 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
                 continue
             solved, cost = found
             if k == 0:
-                jump, P = _motion_beyond(solved, start, end, own)
+                motion = own.end_pose, own.covariance[:3, :3]
+                jump, P = motion_beyond(solved, start, end, *motion)
             else:
                 nodes = (new, end) if k == 1 else (start, new)
                 jump, P = _difference(solved, *nodes)
@@ -378,12 +378,15 @@ def _is_known_start(graph: Graph, place: int) -> bool:
     return bool(graph.fixed[start]) or any(each.nodes == (start,) for each in graph.priors)
 
 
-def _motion_beyond(
-    island: Island, start: int, end: int, own: LocalMap
+def motion_beyond(
+    island: Island, start: int, end: int, motion: Pose, covariance: Covariance
 ) -> tuple[Values, Covariance]:
-    """Return the motion between two poses less the submap's own, in the map's frame."""
+    """Return the motion between two poses less a measured one, in the map's frame.
+
+    motion, covariance: of the end pose in the frame of the start.
+    """
     mean, P = joint_marginal(island, [start, end])
-    predicted = compose(mean[:3], own.end_pose)
+    predicted = compose(mean[:3], motion)
     s, c = core.sin_and_cos(float(mean[2]))
     J = np.zeros((3, 6))
     J[:, 3:] = np.eye(3)
@@ -392,8 +395,8 @@ def _motion_beyond(
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     jump = mean[3:] - predicted
     jump[2:] = wrapped(jump[2:])
-    covariance = dense.product(dense.product(J, P), J.T)
-    return jump, covariance + dense.product(dense.product(R, own.covariance[:3, :3]), R.T)
+    spread = dense.product(dense.product(J, P), J.T)
+    return jump, spread + dense.product(dense.product(R, covariance), R.T)
 
 
 def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
