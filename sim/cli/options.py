@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from teamslam.team.wire.messages import SavedMap
     from teamslam.team.wire.zenoh.bus import ZenohBus
 
-MOST_HOLES = 5
-"""Most log gaps that a command prints; `teamslam log check` prints all."""
-
 
 def check_folder(path: Path) -> None:
     """Refuse a folder that can not be made or written."""
@@ -195,6 +192,8 @@ def warn_of_holes(log: "Log") -> None:
 
 def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
     """Warn of these findings."""
+    from teamslam.team.recording.check import MOST_HOLES
+
     for finding in found[:MOST_HOLES]:
         click.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from teamslam.central.desk.names import in_order, not_joined, short, without_decimals
 from teamslam.sim.launch.watch import DRIVERS, Watch, team_time
+from teamslam.team.recording.inventory import MISSING
 from teamslam.team.wire import messages as m
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def is_live(watch: Watch) -> bool:
 def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
     """Failures and node warnings; absent nodes after PATIENCE_S only.
 
+    The messages that the log lacks are among the notes of the run's result.
     silent_s: age [s] beyond which a warning is dropped; 0: never.
     """
     if time.monotonic() - watch.began <= PATIENCE_S:
@@ -69,6 +71,7 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
         oldest = time.monotonic() - silent_s if silent_s else -math.inf
         fresh = [s for s in statuses if watch.last_message.get(s[0], math.inf) >= oldest]
         texts = [f"{node}: {w}" for node, status in fresh for w in status.warnings]
+    texts = [each for each in texts if not each.startswith(f"recorder: {MISSING}")]
     return [*watch.failures, *(each for each in texts if not any(not_joined([each])))]
 
 

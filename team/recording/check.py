@@ -20,6 +20,8 @@ from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open
 from teamslam.team.wire.codec import WireError
 
 FILE = "file"  # place of a finding without a key
+MOST_HOLES = 5
+"""Most gaps of a log that are printed; `teamslam log check` prints all."""
 
 
 class Finding(NamedTuple):
@@ -127,7 +129,17 @@ class _Evidence:
                 )
 
     def findings(self) -> Iterator[Finding]:
-        """Yield findings by key; of a cut only gaps between two messages of a publisher."""
+        """Yield findings, each key's once, views last; of a cut only gaps between two messages of
+        a publisher.
+        """
+        found = [*self._gaps(), *self._other_findings()]
+        yield from sorted(found, key=lambda each: ch.VIEW.owner(each.where) is not None)
+        named = {each.where for each in found}
+        for note in self.last_word:
+            if note.startswith(MISSING) and _key_of_note(note) not in named:
+                yield Finding("recorder", note)
+
+    def _gaps(self) -> Iterator[Finding]:
         for key in sorted(self.counters.keys() | self.totals.keys()):
             row = ch.channel_of(key)
             if row is not None and (row[0] is ch.ALIVE or row[1] == "recorder"):
@@ -139,6 +151,8 @@ class _Evidence:
             lines = self.counters[key].findings(part=self.part, numbered=numbered, totals=totals)
             again = DRAWN if ch.VIEW.owner(key) is not None else ""
             yield from (Finding(key, line + again) for line in lines)
+
+    def _other_findings(self) -> Iterator[Finding]:
         if self.repaired and not self.part and not self.channels & _FINAL:
             yield Finding(FILE, NO_FINAL)
         if not self.part:
@@ -146,9 +160,11 @@ class _Evidence:
             yield from self.killed()
             if self.channels & _OF_AN_END and not self.channels & _TOTALS:
                 yield Finding(ch.END.key(), NO_END)
-        for note in self.last_word:
-            if note.startswith(MISSING):
-                yield Finding("recorder", note)
+
+
+def _key_of_note(note: str) -> str:
+    """Key in a recorder's note, as `view/map` of `missing: view/map: 20–22`."""
+    return note.removeprefix(MISSING).partition(": ")[0]
 
 
 _NUMBERED = (*ch.SENSORS, ch.SUBMAP)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from teamslam.team.recording.check import check_log, find_misdeclaration
+from teamslam.team.recording.check import DRAWN, check_log, find_misdeclaration
 from teamslam.team.recording.counters import Counters
 from teamslam.team.recording.cut import cut
 from teamslam.team.recording.merge import MERGED, merge
@@ -95,10 +95,11 @@ ALIVE = [
 ]
 FIRST_LOST = "source/alpha: 5 measurements of incarnation 1 missing: 0–4"
 NO_END = "world/end: missing: the number of measurements is unknown"
+TWO_LOST = [s for s in TWO if s.counter not in (3, 4, 8) or "odometry" not in s.key]
 FOUND: dict[str, tuple[list[Sample], list[str]]] = {
     "nothing": (TWO, []),
     "lost messages": (
-        [s for s in TWO if s.counter not in (3, 4, 8) or "odometry" not in s.key],
+        TWO_LOST,
         ["source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8"],
     ),
     "a recorder that came late": (TWO[6:], [FIRST_LOST]),
@@ -131,6 +132,18 @@ FOUND: dict[str, tuple[list[Sample], list[str]]] = {
     "the last words of the recorder": (
         [*ONE, status(0, node="recorder", warnings=("missing: robot/alpha/team/pose: 7",))],
         ["recorder: missing: robot/alpha/team/pose: 7"],
+    ),
+    "the recorder's words on a key that is named already, and views last": (
+        [
+            *(msgspec.structs.replace(status(k), key="view/log") for k in (0, 2)),
+            *TWO_LOST,
+            status(0, node="recorder", warnings=("missing: view/log: 1", "missing: view/map: 3")),
+        ],
+        [
+            "source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8",
+            f"view/log: 1 message missing: 1{DRAWN}",
+            "recorder: missing: view/map: 3",
+        ],
     ),
     "tokens and the recorder's own status": ([*ALIVE, status(4, node="recorder")], []),
     "the first statuses": ([status(4)], ["central/status: 4 messages missing: 0–3"]),

@@ -48,7 +48,7 @@ from teamslam.team.config import SURVEY_FRAME, UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
-from teamslam.team.recording.check import holes
+from teamslam.team.recording.check import MOST_HOLES, holes
 from teamslam.team.recording.reader import Log
 from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.wire import channels as ch
@@ -206,8 +206,14 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
 
 
 def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
-    """Add a note for every gap of the log."""
-    lost = tuple(f"the log is not whole, {finding}" for finding in holes(log))
+    """Add notes on the first gaps of the log, and on their number."""
+    found = holes(log)
+    lost = [f"the log is not whole, {finding}" for finding in found[:MOST_HOLES]]
+    if more := len(found) - len(lost):
+        lost.append(
+            f"the log is not whole, {more} more finding{'s' * (more > 1)}: `teamslam log check "
+            f"{log.path}` names all"
+        )
     return replace(evaluation, notes=(*evaluation.notes, *lost))
 
 

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
 from teamslam.sim.cli.commands import WRONG_USE
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.tables import DatasetError
@@ -187,3 +188,21 @@ def test_chosen_channels_are_exported_as_csv(log, tmp_path):
         "odometry.csv", "truth.csv",
     ]  # fmt: skip
     assert "odometry.csv: 40 rows" in out
+
+
+def test_a_run_with_many_gaps_has_five_notes_and_their_number(tmp_path):
+    path = tmp_path / "log.mcap"
+    views = [
+        msgspec.structs.replace(sample, key=f"view/pose/r{k}", counter=count)
+        for k in range(1, 9)
+        for count, sample in ((0, published()[0]), (2, published()[0]))
+    ]
+    with Recorder(path, "small", {}) as recorder:
+        recorder.write([*published(), *views])
+    log = open_log(path)
+    plain = evaluate(log.samples())
+    notes = add_holes(plain, log).notes[len(plain.notes) :]
+    assert len(notes) == 6
+    assert (
+        notes[-1] == f"the log is not whole, 3 more findings: `teamslam log check {path}` names all"
+    )

@@ -130,5 +130,8 @@ def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):
     assert live.warnings(watch) == ["world: waiting for robot/r2"]
     watch.statuses["world"] = status("world", "publishing")
     assert "robot/r1: no measurements of this team yet" in live.warnings(watch)
+    lacking = ("missing: view/map: 20–22", "missing: view/log: 15", "nothing is recorded: full")
+    watch.statuses["recorder"] = status("recorder", "done", *lacking)
+    assert [w for w in live.warnings(watch) if "recorder" in w] == [f"recorder: {lacking[-1]}"]
     watch.failures.append("robot-r2 (pid 7) was killed")
     assert live.warnings(watch)[0] == "robot-r2 (pid 7) was killed"
