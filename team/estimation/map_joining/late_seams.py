@@ -102,7 +102,9 @@ def find_late_seam(island: Island) -> Seam | None:
 def _sights_of(island: Island) -> _Sights:
     graph = island.graph
     submaps = [each for each in graph.submaps if not is_map(each.contribution.stream)]
-    nodes = np.array(sorted(node for id_, node in graph.landmarks.items() if id_ >= UNNAMED))
+    nodes = np.array(
+        sorted(node for id_, node in graph.landmarks.items() if id_ >= UNNAMED), np.int64
+    )
     place = np.full(len(graph.fixed) + 1, -1, np.int64)
     place[nodes] = np.arange(len(nodes))
     sees = np.zeros((len(submaps), len(nodes)), np.bool_)

@@ -20,6 +20,7 @@ from teamslam.team.estimation.map_joining.late_seams import find_late_seam
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from tests.estimation.association.unnamed_worlds import circle, drive
+from tests.estimation.sighting_world import mirrored
 from tests.scenarios import final_only, scenario_in
 from tests.trials.stress_world import CarriedOff, StressWorld, write
 
@@ -192,3 +193,8 @@ def test_a_landmark_that_two_parts_may_share_is_shown_once(seed):
     assert len(means) >= 5
     assert len({*nearest.tolist()}) == len(means)
     assert not any("odometry alone" in each for each in final.reasons)
+
+
+def test_an_island_without_unnamed_landmarks_has_no_late_seam():
+    island, _ = mirrored(0.02, JoinSettings())
+    assert find_late_seam(island) is None
