@@ -122,16 +122,19 @@ def diagnose(
     *,
     final: bool,
     spoilt: Spoilt = NO_SPOILT,
+    localise: bool = False,
 ) -> tuple[m.Diagnosis, ...]:
     """Find the causes of a map's misfit, the best one by evidence per degree of freedom first.
 
     withdrawn: submaps of withdrawn robots. normal: the right covariance scale; scale: the team's,
-    or its cost per degree of freedom. final: see `find_misscaled`. spoilt: see `cuts_of`.
+    or its cost per degree of freedom. final: see `find_misscaled`. spoilt: see `cuts_of`. localise:
+    the map is a saved one, which shows no robot to be mirrored, since it may be so itself.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
     shared = list(_shared_errors(fold, biases, scale))
-    found = [*shared, *_mirrored(fold, withdrawn), *cuts_of(fold, spoilt)]
+    reflected = () if localise else _mirrored(fold, withdrawn)
+    found = [*shared, *reflected, *cuts_of(fold, spoilt)]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
     noise: list[m.Diagnosis] = []
     try:
@@ -303,7 +306,7 @@ def clock_remedy(late_s: float) -> str:
 
 
 def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> Iterator[m.Diagnosis]:
-    """Find robots whose submaps fit the others' landmarks only reflected.
+    """Find robots whose submaps fit the others' landmarks only reflected; a saved map is no other.
 
     With the centred landmarks z of the map and w of a submap as complex numbers, the best rotation
     leaves Σ|z|² + Σ|w|² − 2 |Σ z conj(w)|, the best reflection the same with |Σ z w|.
@@ -317,6 +320,7 @@ def _mirrored(fold: Fold, withdrawn: Mapping[str, Sequence[Contribution]]) -> It
     seen = np.zeros((len(robots), len(graph.fixed)), np.bool_)
     observers = [number[each.contribution.robot] for each in graph.submaps]
     seen[np.repeat(observers, np.diff(graph.landmark_start)), graph.landmark_nodes] = True
+    seen[[number[robot] for robot in robots if robot.startswith(MAP)]] = False
     count = seen.sum(axis=0)
 
     of = np.repeat(np.arange(len(submaps)), [len(each.local.ids) for each in submaps])

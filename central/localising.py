@@ -14,10 +14,13 @@ from teamslam.central.fused_map import JOINT_LANDMARKS
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.core import packed, unpacked
-from teamslam.team.estimation.contribution import Stream, is_map
+from teamslam.team.estimation.contribution import Stream, is_map, named
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
+from teamslam.team.estimation.map_joining.saved_maps import REMEDY
 from teamslam.team.wire import arrays
 from teamslam.team.wire import messages as m
+
+NOT_JOINED = " not joined: "
 
 
 def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
@@ -47,12 +50,30 @@ def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
 
 
 def in_saved_map(fold: Fold) -> Fold:
-    """Return the fold with the island of the saved map alone, or empty."""
+    """Return the fold with the island of the saved map alone, or empty; its reasons are why the
+    other islands are not in that one.
+    """
     key = next((key for stream, key in sorted(fold.home.items()) if is_map(stream)), None)
     if key is None:
         return EMPTY_FOLD
     home = {stream: at for stream, at in fold.home.items() if at == key}
-    return replace(fold, home=home, starts={})
+    return replace(fold, home=home, starts={}, reasons={**fold.reasons, **_refusals(fold, key)})
+
+
+def _refusals(fold: Fold, key: Stream) -> dict[Stream, str]:
+    of_map = fold.reasons.get(min(fold.islands[key].graph.streams), "")
+    saved = named(next(stream for stream in sorted(fold.home) if is_map(stream)))
+    found = {}
+    for other, island in fold.islands.items():
+        _, why = fold.judged.get((key, other)) or fold.judged.get((other, key)) or (0, "")
+        if not why and other == fold.main_key:
+            why = of_map.partition(NOT_JOINED)[2]
+        if why and other != key:
+            if saved not in why:
+                why = f"with {saved} {why}; it may be the map of another site: {REMEDY}"
+            streams = sorted(island.graph.streams)
+            found[streams[0]] = ", ".join(map(named, streams)) + NOT_JOINED + why
+    return found
 
 
 def seeks_saved_map(fold: Fold, stream: Stream) -> bool:

@@ -227,6 +227,7 @@ class SubmapFold:
             scale,
             final=final,
             spoilt=ticks.submaps_between_parts(fold),
+            localise=self.config.localise,
         )
         self.reasons = join_messages.reasons(
             fold,

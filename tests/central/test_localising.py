@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from teamslam.central.desk.names import not_joined
 from teamslam.central.desk.verification.centre import recompute_centre
 from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.desk.verification.robot import recompute_robot
@@ -31,12 +32,12 @@ SECOND_NS = 1_000_000_000
 
 
 @cache
-def short_day(*, localise=False, wrong=False, length_s=60):
+def short_day(*, localise=False, wrong=None, length_s=60):
     scenario = with_options(load("thesis-b"), seed=1001, localise=localise)
     whole = streams_of(scenario)
     first_ns = min(first for first, _ in whole.spans_ns.values())
     streams = part(whole, first_ns, first_ns + length_s * SECOND_NS, begins=False)
-    saved = with_means(elsewhere) if wrong else first_day()[1]
+    saved = first_day()[1] if wrong is None else with_means(wrong)
     return day(0, [saved], scenario=scenario, streams=streams)
 
 
@@ -66,7 +67,7 @@ def test_a_prior_of_landmarks_alone_comes_first_and_then_one_with_a_pose():
 
 
 def test_a_map_of_another_site_places_no_robot():
-    samples, _, _ = short_day(wrong=True)
+    samples, _, _ = short_day(wrong=elsewhere)
     poses = messages_of(samples, m.PoseEstimate)
     assert poses
     assert not [each for each in poses if each.in_team_frame and each.frame.startswith("map-")]
@@ -123,9 +124,25 @@ def test_a_landmark_that_the_map_lacks_is_left_out_of_submaps():
 
 
 def test_localising_in_the_map_of_another_site_gives_no_path_and_the_same_map():
-    samples, _, _ = short_day(localise=True, wrong=True)
+    samples, _, _ = short_day(localise=True, wrong=elsewhere)
     assert not messages_of(samples, m.Trajectory)
     assert final_map(samples).means == with_means(elsewhere).means
+
+
+def reflected(points):
+    return points * [1.0, -1.0]
+
+
+@pytest.mark.parametrize("wrong", [reflected, elsewhere])
+def test_a_wrong_map_is_named_with_the_remedy_and_no_robot_is_said_to_be_mirrored(wrong):
+    samples, _, _ = short_day(localise=True, wrong=wrong)
+    maps = [*messages_of(samples, m.FusedMap)]
+    assert not [each for of in maps for each in of.diagnosis if each.cause == "mirrored"]
+    apart = dict(not_joined(final_map(samples).reasons))
+    assert set(", ".join(apart).split(", ")) == {"r1", "r2"}
+    for why in apart.values():
+        assert "the saved map site" in why
+        assert why.endswith("load the right map, or save a new one")
 
 
 def test_the_command_localises_a_log_again(tmp_path):

@@ -44,6 +44,8 @@ LEAST_SUBMAPS = 2
 """Fewest submaps that place a landmark elsewhere for it to have moved, if it has no number or its
 former place is empty.
 """
+REMEDY = "load the right map, or save a new one"
+"""For a saved map that does not join."""
 LEAST_AGREEING = 3  # fewest landmarks that must agree where others disagree
 MOST_PAIRS = 2000  # most pairs of shared landmarks from which a frame is proposed
 
@@ -352,7 +354,7 @@ def _refusal(main: Island, other: Island, shared: int, agreeing: int) -> str:
     return (
         f"{shared} shared landmarks disagree: of {named(of.contribution.stream)} no more than "
         f"{agreeing} are at one place; it is the map of another site, or half of the site has "
-        "changed"
+        f"changed: {REMEDY}"
     )
 
 
