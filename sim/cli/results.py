@@ -78,6 +78,8 @@ def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
 
     for table in summary_tables(evaluation):
         console.print(table)
+    for words in evaluation.refused_maps:
+        console.print(f"warning: {words}", markup=False, highlight=False, soft_wrap=True)
     for note in evaluation.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 

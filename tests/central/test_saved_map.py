@@ -489,6 +489,14 @@ def test_the_commands_save_show_and_load_a_map(tmp_path):
         assert isinstance(twice.exception, ScenarioError)  # status 2 of the program
         assert "r1's measurements of this day are in the saved map site" in str(twice.exception)
         assert "recorded" not in twice.output
+    write_map(site, with_means(elsewhere))
+    wrong = run(app, ["rerun", str(later), "--map", str(site), "--json", str(tmp_path / "x.json")])
+    assert wrong.exit_code == 0, wrong.output
+    (warning,) = json.loads((tmp_path / "x.json").read_text())["recomputed"]["warnings"]
+    assert warning["cause"] == "saved_map_not_joined"
+    assert "the saved map site is not in the team's map: 18 shared landmarks" in warning["text"]
+    assert warning["text"].endswith("load the right map, or save a new one")
+    assert f"warning: {warning['text']}" in wrong.output
     for words in (["map", "show", str(log)], ["rerun", str(log), "--map", str(log)]):
         wrong = run(app, words)
         assert wrong.exit_code == 2

@@ -26,6 +26,7 @@ _ABSENT = {
     "withdrawn": ((("by central:", "contradicts_the_rest"),), "ordered"),
 }
 _WARNINGS = (
+    ("is not in the team's map:", "saved_map_not_joined"),
     ("left out", "landmarks_left_out"),
     ("refused", "refused"),
     ("placed weakly", "weak_heading"),

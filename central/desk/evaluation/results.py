@@ -12,12 +12,19 @@ from teamslam.central.desk.evaluation.clocks import Late, clock_cause, is_refute
 from teamslam.central.desk.evaluation.errors import MapErrors, Path, PoseErrors
 from teamslam.central.desk.evaluation.log import Traffic
 from teamslam.central.desk.evaluation.matching import Gospa, Matching
-from teamslam.central.desk.evaluation.states import NO_LANDMARK, RobotState, not_in_the_map
+from teamslam.central.desk.evaluation.states import (
+    NO_LANDMARK,
+    SAVED_MAP,
+    RobotState,
+    not_in_the_map,
+)
 from teamslam.central.desk.left_out import Span
 from teamslam.central.desk.names import not_joined, short
 from teamslam.central.diagnosis import contradicts, describe
 from teamslam.central.saved_maps import COUNTED_TWICE
+from teamslam.team.config import MAP
 from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.map_joining.saved_maps import REMEDY
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 
@@ -272,7 +279,19 @@ class Evaluation:
         reasons = () if self.map is None else self.map.reasons
         of_map = (short(each) for each in reasons if not any(not_joined([each])))
         lost = (f"{name} lost: {of.why}" for name, of in self.states.items() if of.state == "lost")
-        return (*lost, *of_map, *self.separate_times)
+        return (*lost, *self.refused_maps, *of_map, *self.separate_times)
+
+    @property
+    def refused_maps(self) -> tuple[str, ...]:
+        """Warnings of saved maps that are not in the team's, with remedy."""
+        return tuple(
+            f"{SAVED_MAP}{name.removeprefix(MAP)} is not in the team's map: "
+            + (of.why if REMEDY in of.why else f"{of.why}: {REMEDY}")
+            for name, of in self.states.items()
+            if name.startswith(MAP)
+            and of.state in {"not joined", "withdrawn"}
+            and not of.why.startswith("by operator")
+        )
 
     @property
     def title(self) -> str:
