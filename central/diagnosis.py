@@ -6,11 +6,13 @@ robot's submaps states of the map. The covariance scale is judged beside all acc
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+import msgspec
 import numpy as np
 
 from teamslam.central.monitor import SCALE_SIGMAS, find_misscaled
@@ -52,6 +54,12 @@ SEAM_DOF = 3.0
 """Degrees of freedom of a seam."""
 
 REMEDY = "leave the robot on the ground, or restart its process where it is put down"
+OFTEN = 3
+"""Least number of times that a robot is carried off from which its bearings are doubted."""
+SIGN_REMEDY = (
+    "it is named several times: check the sign of its bearings first (counter-clockwise is "
+    "positive, docs/faq.md)"
+)
 START_REMEDY = "correct its initial pose by that, or remove it: a robot is joined without one"
 OTHER_START = "; two initial poses contradict each other, so {other}'s may be the wrong one"
 """Of a team with two known initial poses: a majority would tell."""
@@ -159,9 +167,25 @@ def diagnose(
         costs = marginals.unbounded_costs(island) if final else marginals.terms(island).submaps
         left = find_misscaled(costs, normal, final=final)
         noise = [_noise(*each) for each in left if each.robot not in mirrored]
+    found = doubt_signs(found)
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
     return (*found, *noise)
+
+
+def doubt_signs(found: Sequence[m.Diagnosis]) -> list[m.Diagnosis]:
+    """Add the signs of the bearings to the remedies of a robot that is carried off again and again:
+    without landmark names a mirrored robot shows nothing else.
+    """
+    jumps = Counter(
+        each.robot for each in found if each.cause == hypotheses.CARRIED_OFF and each.at_ns
+    )
+    return [
+        msgspec.structs.replace(each, remedy=f"{each.remedy}; {SIGN_REMEDY}")
+        if each.cause == hypotheses.CARRIED_OFF and jumps[each.robot] >= OFTEN
+        else each
+        for each in found
+    ]
 
 
 def cuts_of(fold: Fold, spoilt: Spoilt = NO_SPOILT) -> Iterator[m.Diagnosis]:

@@ -4,12 +4,13 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
 import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
-from teamslam.central.diagnosis import describe, to_object
+from teamslam.central.diagnosis import describe, doubt_signs, to_object
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import streams_of
@@ -120,6 +121,24 @@ def test_wild_measurements_of_a_robot_for_a_while_are_no_fault_of_landmarks(tmp_
     wild = Burst("r2", 40.0, 70.0, 1.0, 0.5)
     found = diagnosed(scenario(replace(TEAM, bursts=(wild,)), tmp_path))
     assert not [each for each in found if each.landmark is not None]
+
+
+def test_the_sign_of_the_bearings_is_doubted_where_a_robot_is_carried_off_three_times():
+    """Without landmark names nothing else shows a mirrored robot."""
+    off = m.Diagnosis(cause="carried_off", robot="r2", remedy="leave it")
+    once, start = (
+        msgspec.structs.replace(off, robot="r1", at_ns=5),
+        msgspec.structs.replace(off, robot="r1"),
+    )
+    other = m.Diagnosis(cause="clock_offset", robot="r2", remedy="add")
+    often = [msgspec.structs.replace(off, at_ns=at_ns) for at_ns in (1, 2, 3)]
+    rest = [once, start, other]
+    assert doubt_signs([*often[:2], *rest]) == [*often[:2], *rest]
+    found = doubt_signs([*often, *rest])
+    assert found[3:] == rest
+    for each in found[:3]:
+        assert each.remedy.startswith("leave it; ")
+        assert "check the sign of its bearings" in each.remedy
 
 
 def test_a_mirrored_robot_is_named_as_mirrored(tmp_path):
