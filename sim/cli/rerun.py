@@ -201,7 +201,8 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         plain = isinstance(log, DataSetRun) and changes == Changes()
         computed = list(log.samples()) if plain else changed_run(log, changes)
         changed = recorded if plain else evaluate(computed)
-    runs = {"computed": changed} if plain else {"recorded": recorded, "recomputed": changed}
+    before = "unchanged" if isinstance(log, DataSetRun) else "recorded"
+    runs = {"computed": changed} if plain else {before: recorded, "recomputed": changed}
     table = Table("", *runs)
     for figure, cells in compare_rows(runs):
         table.add_row(Text(figure), *map(Text, cells))

@@ -1,7 +1,8 @@
 """Check scenarios: errors name field path, known values and remedy."""
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -90,8 +91,11 @@ def close(name: object, known: Iterable[str]) -> str:
     return f"; did you mean `{found[0]}`?" if found else ""
 
 
-def plain_error(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
-    """Convert "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b"."""
+def plain_error(error: msgspec.ValidationError, at: str = "", of: object = None) -> ScenarioError:
+    """Convert "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b".
+
+    of: the converted fields; a number out of its bounds is named: "expected float > 0 at a.b: 0".
+    """
     problem, _, path = str(error).partition(" - at `")
     field = path.rstrip("`").removeprefix("$").lstrip(".")
     where = ".".join(part for part in (at, field) if part)
@@ -99,7 +103,23 @@ def plain_error(error: msgspec.ValidationError, at: str = "") -> ScenarioError:
     problem = problem.replace(f"float <= {math.pi}", "radians, half a turn at most,")
     for pattern, words in _IN_WORDS.items():
         problem = problem.replace(f"str matching regex '{pattern}'", words)
-    return ScenarioError(f"{problem} at {where}" if where else problem)
+    value = _value_at(path.rstrip("`"), of)
+    given = f": {value}" if isinstance(value, int | float) and ", got " not in problem else ""
+    return ScenarioError(f"{problem} at {where}{given}" if where else problem)
+
+
+def _value_at(path: str, of: object) -> object:
+    """Value at a path such as `$.robots[0].id` of nested fields; None if there is none."""
+    if "[...]" in path:  # of a key that the path does not state
+        return None
+    for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
+        if isinstance(of, Mapping):
+            of = of.get(name)
+        elif isinstance(of, Sequence) and index and int(index) < len(of):
+            of = of[int(index)]
+        else:
+            return None
+    return of
 
 
 def _is_struct(declared: Any) -> bool:

@@ -209,4 +209,4 @@ def _check_part(value: Fields, declared: type[msgspec.Struct], at: str, needed: 
     try:
         msgspec.convert(needed | value, declared)
     except msgspec.ValidationError as error:
-        raise plain_error(error, at) from None
+        raise plain_error(error, at, needed | value) from None

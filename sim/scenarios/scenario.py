@@ -255,7 +255,7 @@ def _convert(fields: Fields) -> Scenario:
     try:
         return _fill_in(msgspec.convert(fields, Scenario))
     except msgspec.ValidationError as error:
-        raise plain_error(error) from None
+        raise plain_error(error, of=fields) from None
 
 
 def _fill_in(scenario: Scenario) -> Scenario:

@@ -99,6 +99,7 @@ def test_the_page_has_the_figures_of_the_built_in_scenario_that_merging_keeps():
     stated = tomllib.loads("\n".join(re.findall(r"`((?:forward|turn|lateral) = {.*?})`", noise)))
     assert stated == {name: built_in["motion"][name] for name in ("forward", "turn", "lateral")}
     assert f"`range_sigma_per_m = {per_m}`" in noise
+    assert "`pip install 'teamslam[calibrate]'`" in noise
 
 
 def test_the_clock_of_the_page_is_added_to_its_scenario(tmp_path, monkeypatch):

@@ -139,4 +139,5 @@ def test_a_data_set_is_rerun_under_other_conditions(data_set, tmp_path):
     arguments = ["rerun", str(data_set), "--delay", "2", "--json", str(to)]
     result = output_of(*arguments)
     assert "final map: the same bytes" in result
+    assert " unchanged " in result.splitlines()[1]
     assert json.loads(to.read_text())["same_final_map"]

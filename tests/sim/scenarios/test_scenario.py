@@ -128,7 +128,10 @@ UTIAS = 'world = { kind = "utias" }\n'
             "unknown field `per_y` at robots[1].motion.turn",
         ),
         (SMALL + "[defaults.sensor]\nrange_sigma = 'a'", "expected float, got str at defaults.s"),
-        (SMALL + "[defaults.sensor]\nrange_sigma = 0", "expected float > 0.0 at defaults.sensor"),
+        (
+            SMALL + "[defaults.sensor]\nrange_sigma = -0.5",
+            "expected float > 0.0 at defaults.sensor.range_sigma: -0.5",
+        ),
         (SMALL + "[defaults.sensor]\nrange_sigma = nan", "expected a finite number, got nan at d"),
         (SMALL + "x = = 2", "line 6, column 5"),
         ("robot_count = 1001\n" + SMALL, "1001 robots: a team has 1 to 1000"),
