@@ -22,7 +22,7 @@ from teamslam.team.config import MAP, UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Contribution, Stream, moment, named, part_of
 from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, information
-from teamslam.team.estimation.map_joining import hypotheses, marginals
+from teamslam.team.estimation.map_joining import hypotheses, marginals, saved_maps
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.se2 import Pose, compose, wrapped
@@ -144,6 +144,7 @@ def diagnose(
     reflected = () if localise else _mirrored(fold, withdrawn)
     found = [*shared, *reflected, *cuts_of(fold, spoilt)]
     mirrored = {each.robot for each in found if each.cause == "mirrored"}
+    undecided = set() if final else _landmarks_of_saved_maps(fold)
     noise: list[m.Diagnosis] = []
     try:
         accepted, island = hypotheses.explain(fold.main)
@@ -162,7 +163,7 @@ def diagnose(
                 at_ns=each.at_ns,
             )
             for each in accepted
-            if each.subject not in mirrored and not _is_bent(each, shared)
+            if each.subject not in mirrored | undecided and not _is_bent(each, shared)
         ]
         costs = marginals.unbounded_costs(island) if final else marginals.terms(island).submaps
         left = find_misscaled(costs, normal, final=final)
@@ -186,6 +187,12 @@ def doubt_signs(found: Sequence[m.Diagnosis]) -> list[m.Diagnosis]:
         else each
         for each in found
     ]
+
+
+def _landmarks_of_saved_maps(fold: Fold) -> set[int | str]:
+    """List the landmarks that may have moved since a saved map: the final map lists the changes."""
+    maps = (each.contribution.local for each in saved_maps.maps_of(fold.main.graph))
+    return {id_ for each in maps for id_ in each.ids.tolist()}
 
 
 def cuts_of(fold: Fold, spoilt: Spoilt = NO_SPOILT) -> Iterator[m.Diagnosis]:

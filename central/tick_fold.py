@@ -28,7 +28,7 @@ from teamslam.central import withdrawal
 from teamslam.central.checkpoints import Checkpoints
 from teamslam.central.config import CentralConfig
 from teamslam.central.fold_inputs import FoldInputs
-from teamslam.team.config import BIASES
+from teamslam.team.config import BIASES, MAP
 from teamslam.team.estimation import contribution
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.map_joining import joining, marginals
@@ -245,7 +245,8 @@ class TickFold:
     def _convict(self, fold: joining.Fold, at: float) -> bool:
         """Withdraw or suspend the robot that a trial finds; return whether there is one.
 
-        at: the tick; infinity for the full solution, which suspends no robot.
+        at: the tick; infinity for the full solution, which suspends no robot. Before that, no
+        robot is reported to contradict a saved map: landmarks may have moved since.
         """
         self.undecided = ""
         if not self._tries and math.isfinite(at):
@@ -260,7 +261,8 @@ class TickFold:
             return False
         if fold is self.fold:
             self.checkpoints.note_tested(fold.size)
-        self.undecided = found.undecided
+        has_map = any(each.startswith(MAP) for each in found.opposed)
+        self.undecided = "" if has_map and math.isfinite(at) else found.undecided
         if found.robot is None or not self.convicts:
             return False
         own = sum(n + 1 for stream, n in self.members(fold).items() if stream[0] == found.robot)

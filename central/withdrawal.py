@@ -49,11 +49,14 @@ Without = Callable[[Collection[str]], Agreement | None]
 
 @dataclass(frozen=True)
 class Trial:
-    """The robot that is wrong beyond chance; undecided: robots that contradict each other."""
+    """The robot that is wrong beyond chance; undecided: robots that contradict each other
+    (opposed).
+    """
 
     robot: str | None = None
     reason: str = ""
     undecided: str = ""
+    opposed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -190,7 +193,8 @@ def hold_trial(agreement: Agreement, limit: float, without: Without) -> Trial:
         or _contradicts_itself(without(team - {robot}), robot, limit)
     ]
     if len(wrong) != 1:
-        return Trial(undecided=_words_of(tuple(sorted(cleared)), found))
+        opposed = tuple(sorted(cleared))
+        return Trial(undecided=_words_of(opposed, found), opposed=opposed)
     robot = wrong[0]
     return Trial(
         robot,

@@ -13,12 +13,14 @@ from teamslam.central.desk.verification.centre import recorded_map
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.central.saved_maps import NothingToSaveError, save_map
+from teamslam.central.withdrawal import Trial
 from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import ScenarioError, load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.core import unpacked
+from teamslam.team.estimation.map_joining import hypotheses
 from teamslam.team.estimation.map_joining.alignment import align, procrustes
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.saved_map import SavedMapError, map_figures, read_map, write_map
@@ -289,6 +291,42 @@ def test_a_map_of_which_half_the_landmarks_have_moved_is_withdrawn_and_changes_n
     assert numbers(fused) == numbers(final_map(second_day(loaded=False, moved=moved)[0]))
     words = " ".join((*centre.warnings, *fused.reasons))
     assert "elsewhere" in words or "disagree" in words
+
+
+def test_running_maps_await_the_final_one_where_a_landmark_of_a_saved_map_has_two_places(
+    monkeypatch,
+):
+    fold = day(1001, [first_day()[1]])[1].maps.fold
+
+    def explain(island):
+        places = (
+            hypotheses.Hypothesis(
+                "identity_shared", id_, frozenset({"r1"}), 0, (0.5, 0.0), (0.01,), 99.0, 2, island
+            )
+            for id_ in (4, 1000)
+        )
+        return list(places), island
+
+    monkeypatch.setattr(hypotheses, "explain", explain)
+
+    def named(tail):
+        causes = fold.make_map(tail)[0 if tail == "closed" else -1].message.diagnosis
+        return {each.landmark for each in causes if each.cause == "identity_shared"}
+
+    assert named("closed") == {1000}
+    assert named("final") == {4, 1000}
+
+
+@pytest.mark.parametrize("opposed", [("map-site", "r1"), ("r1", "r2")])
+def test_a_running_map_asks_nobody_to_withdraw_a_saved_map(opposed, monkeypatch):
+    words = f"{', '.join(opposed)} contradict each other"
+    trial = Trial(undecided=words, opposed=opposed)
+    ticks = day(1001, [first_day()[1]])[1].maps.fold._ticks
+    monkeypatch.setattr(ticks, "_try_robots", lambda *_: trial)
+    assert not ticks._convict(ticks.fold, 30.0)
+    assert ticks.undecided == ("" if "map-site" in opposed else words)
+    assert not ticks._convict(ticks.fold, np.inf)
+    assert ticks.undecided == words
 
 
 def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
