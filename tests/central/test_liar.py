@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central import tick_fold
+from teamslam.central import withdrawal
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.submap_fold import SubmapFold
 from teamslam.central.withdrawal import Trial, hold_trial
@@ -167,7 +167,7 @@ def test_a_trial_without_a_verdict_is_repeated_once_the_provisional_set_has_grow
         return Trial(undecided="r1, r2 contradict each other")
 
     samples = run_with("r1", "swap")
-    monkeypatch.setattr(tick_fold, "hold_trial", undecided)
+    monkeypatch.setattr(withdrawal, "hold_trial", undecided)
     early = tuple(each for each in samples if each.stamp_ns <= 30e9)
     ticks = of_set(early)
     first = ticks.fold_ahead()
