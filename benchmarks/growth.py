@@ -37,12 +37,9 @@ from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
 
 TICK_S = 10.0
-WINDOW = 25
-"""Ticks per median."""
-SEEN = 8
-"""Mean number of landmarks detected in a window."""
-SPACING_M = 10.0
-"""Spacing of neighbouring landmarks."""
+WINDOW = 25  # ticks per median
+SEEN = 8  # mean number of landmarks detected in a window
+SPACING_M = 10.0  # spacing of neighbouring landmarks
 SIGMAS = (0.1, 0.02, 0.2)
 """Standard deviations of a submap: end position [m], end heading [rad], landmark [m]."""
 

@@ -30,8 +30,7 @@ from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.zenoh.bus import ZenohBus
 
 PUBLISHERS = 2
-LANDMARKS = 5
-"""Landmarks per observation."""
+LANDMARKS = 5  # landmarks per observation
 _COMMAND = [sys.executable, "-m", "teamslam"]
 
 

@@ -19,8 +19,7 @@ from mcap.reader import make_reader
 from teamslam.central.desk.verification.verification import verify
 from teamslam.team.recording.reader import LogError, open_log
 
-LEAST = 35.0
-"""× real time for a team of five."""
+LEAST = 35.0  # × real time for a team of five
 
 
 def read_plainly(path: Path) -> tuple[int, float]:

@@ -39,8 +39,7 @@ from teamslam.team.wire.zenoh.router import router
 
 TEAM = "bench"
 PINGS = 500
-A_TURN = 500
-"""Messages per turn with the boundary, or without."""
+A_TURN = 500  # messages per turn with the boundary, or without
 _HERE = [sys.executable, "-m", "benchmarks.security"]
 
 

@@ -33,29 +33,24 @@ Values = Float[np.ndarray, " _"]
 Covariance = Float[np.ndarray, "3 3"]
 Spoilt = Mapping[Seam, Sequence[Contribution]]
 NO_SPOILT: Spoilt = MappingProxyType({})
-SIGMAS = 4.0
-"""Least size of a shared error in its standard deviations."""
+SIGMAS = 4.0  # least size of a shared error in its standard deviations
 NONLINEAR = 0.08
 """Standard deviation of a shared error's estimate as a share of it. The submaps' sensitivities are
 a smoother's; the mean of 100 particles answers errors by a few per cent more.
 """
 LEAST_SHARED = 3
 """Least number of landmarks that a submap shares with the others' map to show a reflection."""
-LEAST_MIRRORED = 4
-"""Least number of such submaps."""
-MIRRORED = 0.8
-"""Least share of them that fit reflected, and not as they are."""
+LEAST_MIRRORED = 4  # least number of such submaps
+MIRRORED = 0.8  # least share of them that fit reflected, and not as they are
 MIRRORED_REMEDY = (
     "negate the robot's bearings, or its odometry's turns if these are wrong "
     "(counter-clockwise is positive)"
 )
 
-SEAM_DOF = 3.0
-"""Degrees of freedom of a seam."""
+SEAM_DOF = 3.0  # degrees of freedom of a seam
 
 REMEDY = "leave the robot on the ground, or restart its process where it is put down"
-OFTEN = 3
-"""Least number of times that a robot is carried off from which its bearings are doubted."""
+OFTEN = 3  # least number of times that a robot is carried off from which its bearings are doubted
 SIGN_REMEDY = (
     "it is named several times: check the sign of its bearings first (counter-clockwise is "
     "positive, docs/faq.md)"
@@ -80,8 +75,7 @@ class _SharedError(NamedTuple):
 NOISY: Final = "noise_underestimated"
 DOUBTFUL_SCALE = 10.0
 """Covariance scale, and inverse of one, from which the data are doubted beside the sigmas."""
-MOST_SCALE = 100.0
-"""Least covariance scale that no noise explains: sigmas ten times too small."""
+MOST_SCALE = 100.0  # least covariance scale that no noise explains: sigmas ten times too small
 _CLOCK = (
     "add {value:.3g} to its clock_offset_s, which moves its path to the camera's clock, or, to "
     "keep the team's clock, subtract {value:.3g} s from the stamps of its detections"

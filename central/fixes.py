@@ -25,16 +25,13 @@ from teamslam.team.estimation.se2 import inverse, transformed
 from teamslam.team.shapes import Float
 
 LEAST_FIXES = 12
-DISCOUNTED = 0.5
-"""A fix of less weight contradicts the map."""
+DISCOUNTED = 0.5  # a fix of less weight contradicts the map
 MOST_AGAINST = 0.25
 """Share of contradicting fixes above which their errors are not those that the robot states."""
-SIGMAS = 5.0
-"""Least size of a delay or an antenna's displacement in its standard deviations."""
+SIGMAS = 5.0  # least size of a delay or an antenna's displacement in its standard deviations
 LEAST = (0.3, 0.3, 0.1)
 """Least displacement of the antenna, ahead and left [m], and least delay [s]."""
-PRIOR_SIGMA = 10.0
-"""Weak prior of each [m, m, s], for paths that do not determine it."""
+PRIOR_SIGMA = 10.0  # weak prior of each [m, m, s], for paths that do not determine it
 
 
 class _Residual(NamedTuple):

@@ -9,10 +9,8 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import find_error
 
-START_POSES = "start poses"
-"""The frame of a map that lies in the frame of the given initial poses."""
-JOINT_LANDMARKS = 2000
-"""A map with more landmarks carries their 2 × 2 covariances only."""
+START_POSES = "start poses"  # the frame of a map that lies in the frame of the given initial poses
+JOINT_LANDMARKS = 2000  # a map with more landmarks carries their 2 × 2 covariances only
 
 
 def fused_message(

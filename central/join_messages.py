@@ -31,20 +31,17 @@ from teamslam.team.wire.bus import Outgoing
 
 Tail = Literal["final", "closed", "provisional"]
 """The kind of a map: the last one; one with all submaps up to a time; one with later ones, too."""
-PRIOR_LANDMARKS = 30
-"""Most landmarks in a robot's prior: the nearest ones."""
+PRIOR_LANDMARKS = 30  # most landmarks in a robot's prior: the nearest ones
 CONFIRMED_BY = 2
 """Least submaps of an unnamed landmark in the final map: a few false detections in a row look like
 a landmark in one window. Running maps show tentative ones, too.
 """
-NAMED = 10
-"""Most names in a list of omitted landmarks, refusals, or robots of an island."""
+NAMED = 10  # most names in a list of omitted landmarks, refusals, or robots of an island
 LANDMARKS_ALONE = 100
 """Most landmarks in the prior of a robot outside the team's map: those nearest to the origin of its
 frame, where the robots of the first day began.
 """
-FEW = 3
-"""Most pairs of landmarks without names in such a list."""
+FEW = 3  # most pairs of landmarks without names in such a list
 NONE_SHARED = f"not joined: {SharedPoints(0)}, "
 
 

@@ -48,8 +48,7 @@ FRESH_SHARE = 1.0 / 3.0
 """Share of the time for maps that are not due: a due map waits for at most two solutions."""
 FAREWELL_S = 10.0
 """Longest delay [s] of the centre's exit after its final map: it leaves after the others."""
-ORDERS_S = 30.0
-"""Time [s] between two queries to the router for an operator's orders."""
+ORDERS_S = 30.0  # time [s] between two queries to the router for an operator's orders
 _ORDERS = m.KeptRequest(
     stamp_ns=0, channels=tuple(each.name for each in ch.ORDERS if each is not ch.ORDER_SIGNATURE)
 )
@@ -81,8 +80,7 @@ class CentralShell:
         self._shell.notes = self._awaited
         self._shell.believed = self._store_and_filter
         self._shell.refresh_by(self.node.refresh, FRESH_SHARE)
-        self._lost: dict[str, Sample] = {}
-        """Tokens of lost robots that the node has not received."""
+        self._lost: dict[str, Sample] = {}  # tokens of lost robots that the node has not received
         self._since: dict[str, float] = {}
         self._alive: set[str] = set()
         self._stop = stop

@@ -17,8 +17,7 @@ from teamslam.team.estimation.consistency import Scale
 from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
 from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
 
-SCALE_WARN = math.sqrt(2.0)
-"""Bound of the team's covariance scale; its inverse is the lower one."""
+SCALE_WARN = math.sqrt(2.0)  # bound of the team's covariance scale; its inverse is the lower one
 ROBOT_WARN = 1.5
 """Bound of a robot's covariance scale: one of five sound robots of the real data sets reaches
 1.4."""

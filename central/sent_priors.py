@@ -20,14 +20,11 @@ EVERY = 8
 """Most broadcasts between two priors, which bounds the robot's own submaps to join and the delay of
 a robot that missed one.
 """
-NEEDED = 12
-"""Number of landmarks nearest to a robot, which it will see next."""
+NEEDED = 12  # number of landmarks nearest to a robot, which it will see next
 MOVED = 0.1
 """Least root mean square of the landmarks' movements for a new prior, in standard deviations."""
-SURER = 0.8
-"""Share to which a landmark's variance must have fallen for a new prior."""
-NEVER = -1
-"""Stamp of no inter-robot measurement, before all team time."""
+SURER = 0.8  # share to which a landmark's variance must have fallen for a new prior
+NEVER = -1  # stamp of no inter-robot measurement, before all team time
 
 
 @dataclass(frozen=True)
@@ -56,8 +53,7 @@ class SentPriors:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._sent: dict[Stream, _Sent | None] = {}
-        """None: the stream's priors are withdrawn."""
+        self._sent: dict[Stream, _Sent | None] = {}  # None: the stream's priors are withdrawn
 
     def select_worth(
         self,

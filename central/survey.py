@@ -19,10 +19,8 @@ from teamslam.team.saved_map import datum_in, member_of
 from teamslam.team.wire.arrays import floats, from_ids
 from teamslam.team.wire.messages import FusedMap, SavedMap, Submap
 
-FARTHEST_M = 2e5
-"""Largest coordinate in the tangent plane of a datum."""
-DIGEST = bytes(8)
-"""The configuration names the survey, its submap names no other one."""
+FARTHEST_M = 2e5  # largest coordinate in the tangent plane of a datum
+DIGEST = bytes(8)  # the configuration names the survey, its submap names no other one
 
 
 def survey_of(

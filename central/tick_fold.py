@@ -44,10 +44,8 @@ from teamslam.team.wire.messages import SightingFactor, Submap
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""
-GROWTH = 1.25
-"""Growth of the set after which suspects that were not withdrawn are tested again."""
-LATE_CUTS = 3
-"""Most seams that the final map cuts beside those of running maps."""
+GROWTH = 1.25  # growth of the set after which suspects that were not withdrawn are tested again
+LATE_CUTS = 3  # most seams that the final map cuts beside those of running maps
 FULL_UNNAMED = 1000
 """Most submaps without landmark names for which the full solution folds all ticks again, since the
 ticks decide which observations are one landmark. With more, which would take hours, it starts from

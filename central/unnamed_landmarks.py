@@ -13,12 +13,9 @@ from teamslam.team.wire.arrays import from_floats, from_ids
 
 STEPS = ("", *member_log.KINDS)
 """The step that merged an unnamed landmark into a set, by its number on the wire."""
-DECISIONS = 100
-"""Most accepted decisions in a map, and most deferred ones."""
-LARGEST = 1e300
-"""Bound of the figures of a merge on the wire, which are finite there."""
-SHOWN = 1 + member_log.LAST
-"""Most members of a landmark in a running map; all are in the final one."""
+DECISIONS = 100  # most accepted decisions in a map, and most deferred ones
+LARGEST = 1e300  # bound of the figures of a merge on the wire, which are finite there
+SHOWN = 1 + member_log.LAST  # most members of a landmark in a running map; all are in the final one
 
 
 def memberships_of(landmarks: Landmarks, every: bool = True) -> tuple[m.Membership, ...]:

@@ -30,14 +30,12 @@ FEWEST, NEWEST, MOST_OF = 2, 4, 3
 """With fewer submaps a robot is judged by its NEWEST ones, FEWEST at least: the disagreement that
 MOST_OF of them exceed, or all if there are no more.
 """
-AGREEING = 0.5
-"""Share of the limit that no disagreement may exceed for the rest to agree."""
+AGREEING = 0.5  # share of the limit that no disagreement may exceed for the rest to agree
 TRIED = 3
 """Most robots left out for a trial, the most suspect first; as many again of those that disagree
 least, since the map follows an overconfident robot.
 """
-LEAST_DOF = 3.0
-"""Least degrees of freedom of a share of the joint cost that is judged."""
+LEAST_DOF = 3.0  # least degrees of freedom of a share of the joint cost that is judged
 SUSPICION, ACCORD = 20.0, 7.0
 """Exponents of the chance that a sound robot's share exceeds `_bound`: for a suspect, and for one
 no longer in accord with the rest.

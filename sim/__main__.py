@@ -2,8 +2,7 @@
 
 import sys
 
-INTERRUPTED = 130
-"""The exit status of a command that Ctrl-C has ended, as a shell has it."""
+INTERRUPTED = 130  # the exit status of a command that Ctrl-C has ended, as a shell has it
 
 
 def main() -> None:

@@ -19,10 +19,8 @@ from teamslam.team.wire.logs import LOG
 from teamslam.team.wire.text import cut, one_line
 
 M = TypeVar("M", bound=m.Message)
-MOST_ANSWERS = 1000
-"""Most attempts of a node to continue after one message."""
-LONGEST_TEXT = 1000
-"""Longest text of an exception or a key in a fault [characters]."""
+MOST_ANSWERS = 1000  # most attempts of a node to continue after one message
+LONGEST_TEXT = 1000  # longest text of an exception or a key in a fault [characters]
 _OURS = ("teamslam.",)
 
 

@@ -8,10 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from teamslam.team.config import MAP
 from teamslam.team.wire import messages as m
 
-MOST_LIVES = 1_000
-"""Most incarnations of a stream."""
-MOST_COUNT = 2**40
-"""Largest counter: 348 years at 100 Hz."""
+MOST_LIVES = 1_000  # most incarnations of a stream
+MOST_COUNT = 2**40  # largest counter: 348 years at 100 Hz
 EARLY_NS = 86_400 * 10**9
 LATE_NS = 400 * EARLY_NS
 """Stamps of a stream lie from EARLY_NS before to LATE_NS after that of its initial pose."""

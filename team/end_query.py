@@ -10,8 +10,7 @@ from teamslam.team.wire.channels import FINAL_MAP, KEPT, Channel, channel_of
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.messages import KeptRequest
 
-FINAL_S = 3.0
-"""Time [s] between two queries to the router for a missed end."""
+FINAL_S = 3.0  # time [s] between two queries to the router for a missed end
 FINAL_ASK_S = 2.0
 SINCE = "TEAMSLAM_SINCE"
 """Environment variable: start of the run [ns, wall clock], if earlier than that of the process."""

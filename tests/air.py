@@ -8,8 +8,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.estimation.hybrid_slam.window import generator
 
-Reach = Callable[[str, str, int], bool]
-"""Whether two nodes reach each other at a team time [ns]."""
+Reach = Callable[[str, str, int], bool]  # whether two nodes reach each other at a team time [ns]
 
 
 def always(one: str, other: str, now_ns: int) -> bool:

@@ -34,8 +34,7 @@ from tests.support import ROOT
 TABLE = Path(__file__).with_suffix(".json")
 SETS = ROOT.parent / "shared" / "utias"
 PAIR_STEPS = 30
-ESTIMATES = ("estimate", "robots")
-"""The hashes that no version of a message changes."""
+ESTIMATES = ("estimate", "robots")  # the hashes that no version of a message changes
 Row = Mapping[str, str]
 
 

@@ -12,8 +12,7 @@ import msgspec
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 
-S = 1_000_000_000
-"""One second [ns]."""
+S = 1_000_000_000  # one second [ns]
 M = TypeVar("M")
 ORDINARY: dict[str, Any] = {
     "stamp_ns": 0, "robot": "r1", "incarnation": 1, "sequence": 0, "exchange": 0, "steps": 0,

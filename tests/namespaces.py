@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 NET = "10.213.77"
-HOSTS = Path("/etc/netns")
-"""`ip netns exec` lays the files of HOSTS/NAMESPACE over those in /etc."""
+HOSTS = Path("/etc/netns")  # `ip netns exec` lays the files of HOSTS/NAMESPACE over those in /etc
 
 
 def ip(*words: str) -> None:

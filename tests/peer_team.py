@@ -20,8 +20,7 @@ from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.air import Air
 
-AFTER_S = 3600.0
-"""Team time [s] after the streams' end at which incomplete peers give up."""
+AFTER_S = 3600.0  # team time [s] after the streams' end at which incomplete peers give up
 Make = Callable[[Scenario, RobotConfig], PeerRobot]
 
 

@@ -23,8 +23,7 @@ from tests import build
 
 LANDMARKS = np.array([[5.0, 3.0], [9.0, -2.0], [14.0, 4.0], [20.0, -3.0], [3.0, -4.0]])
 STEP_NS = 1_000_000_000
-LOCALISERS = ("localisation", "dead-reckoning")
-"""The estimators without a map of their own."""
+LOCALISERS = ("localisation", "dead-reckoning")  # the estimators without a map of their own
 
 
 def config(name: str = "r1", **options: object) -> RobotConfig:

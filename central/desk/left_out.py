@@ -14,8 +14,7 @@ from teamslam.team.estimation.contribution import moment
 from teamslam.team.shapes import Bool, Int64
 from teamslam.team.wire import messages as m
 
-Span = tuple[int, int]
-"""Stamps [ns] between which the poses are left out; those at its ends stay."""
+Span = tuple[int, int]  # stamps [ns] between which the poses are left out; those at its ends stay
 ALWAYS: Span = (np.iinfo(np.int64).min, np.iinfo(np.int64).max)
 
 

@@ -8,8 +8,7 @@ import msgspec
 
 from teamslam.central.config import UNREADABLE
 
-OUTSIDE = "not in the team's frame"
-"""Replaces the error of poses outside the team map's frame."""
+OUTSIDE = "not in the team's frame"  # replaces the error of poses outside the team map's frame
 _DIGITS = re.compile("([0-9]+)")
 _DECIMAL = re.compile(r"\d+\.\d+")
 _NOT_JOINED = " not joined: "

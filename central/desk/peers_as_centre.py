@@ -129,8 +129,7 @@ LISTENS = (
     *OF_AGREEMENT,
 )  # fmt: skip
 _FOLD = "fold."
-_LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)
-"""Used unless a centre has published them."""
+_LAST = (ch.TEAM_FINAL, ch.CONCLUDED, ch.TEAM_TRAJECTORY)  # used unless a centre has published them
 
 
 class PeersAsCentre:

@@ -51,14 +51,10 @@ class PeerCentre(Peer):
         return msgspec.structs.replace(own, figures=figures, warnings=(*own.warnings, *faults))
 
 
-LINGER_S = 5.0
-"""Time [s] for which a robot stays once all have concluded."""
-FRESH_SHARE = 0.2
-"""Share of the time for maps that are not due."""
-WORLD_GONE_S = 1.0
-"""Delay [s] after the world's end before a peer leaves, longer than a restart."""
-_ENDS = (ch.CONCLUDED,)
-"""Channels that end a team of peers."""
+LINGER_S = 5.0  # time [s] for which a robot stays once all have concluded
+FRESH_SHARE = 0.2  # share of the time for maps that are not due
+WORLD_GONE_S = 1.0  # delay [s] after the world's end before a peer leaves, longer than a restart
+_ENDS = (ch.CONCLUDED,)  # channels that end a team of peers
 _ORDERS = m.KeptRequest(stamp_ns=0, channels=tuple(each.name for each in ch.ORDERS))
 _LOG = logging.getLogger("teamslam")
 

@@ -15,8 +15,7 @@ from teamslam.team.wire.codec import decoded, encoded
 
 SET_CHANNELS = (*CHANNELS, ch.SIGNATURE, ch.ORDER_SIGNATURE, ch.SET_SUMMARY, ch.CARRIED)
 """Channels of the set's traffic figures."""
-CENTRE = "central"
-"""The node name of a centre."""
+CENTRE = "central"  # the node name of a centre
 
 
 class Peer:

@@ -42,18 +42,13 @@ from teamslam.team.config import MotionModel, MotionNoise
 
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
-MISTRUST = 4.0
-"""Factor on odometry noise densities without truth."""
+MISTRUST = 4.0  # factor on odometry noise densities without truth
 ROUNDS = 2
-SYSTEMATIC = 0.02
-"""Relative standard deviation of a forward scale from the joined map."""
-CLOCK_ROUNDS = 3
-"""Repetitions of the estimate of clocks, linear in an offset."""
+SYSTEMATIC = 0.02  # relative standard deviation of a forward scale from the joined map
+CLOCK_ROUNDS = 3  # repetitions of the estimate of clocks, linear in an offset
 TYPICAL_M = 3.0
-BETTER = 0.8
-"""A range model is reported if it reduces σ at TYPICAL_M below this share."""
-ALARM = 0.015
-"""Relative scale difference that does not fit the scenario."""
+BETTER = 0.8  # a range model is reported if it reduces σ at TYPICAL_M below this share
+ALARM = 0.015  # relative scale difference that does not fit the scenario
 
 
 Progress = Callable[[str], None]

@@ -19,14 +19,10 @@ from teamslam.team.estimation.se2 import between, logarithm
 from teamslam.team.shapes import Bool, Float
 
 SPAN_NS = 10_000_000_000
-LEAST = 30
-"""Least number of spans or measurements for a factor."""
-CERTAIN_M = 0.02
-"""Largest 3σ position uncertainty [m] of a reported mount."""
-NEGLIGIBLE_M = 0.005
-"""Smallest reported mount deviation [m]."""
-DISTANT = 3.0
-"""Standard deviations from which a mount deviation is significant."""
+LEAST = 30  # least number of spans or measurements for a factor
+CERTAIN_M = 0.02  # largest 3σ position uncertainty [m] of a reported mount
+NEGLIGIBLE_M = 0.005  # smallest reported mount deviation [m]
+DISTANT = 3.0  # standard deviations from which a mount deviation is significant
 
 UNITS = {"covariance_factor": ""}
 

@@ -20,16 +20,12 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import bias_estimates
 from teamslam.team.shapes import Float, Int64
 
-LEAST = 200
-"""Least number of detections, and of odometry turns."""
+LEAST = 200  # least number of detections, and of odometry turns
 ROUNDS = 6
 STEP_NS = 10_000_000
-LARGEST_S = 2.0
-"""Largest plausible clock offset."""
-BEYOND_DOUBT = 4.0
-"""Standard deviations from which an offset is applied."""
-LEAST_S = 0.01
-"""Smallest applied offset [s]."""
+LARGEST_S = 2.0  # largest plausible clock offset
+BEYOND_DOUBT = 4.0  # standard deviations from which an offset is applied
+LEAST_S = 0.01  # smallest applied offset [s]
 SETTLED_S = 1e-4
 
 UNITS = {"detections": "s", "odometry": "s", "clock_offset_s": "s"}

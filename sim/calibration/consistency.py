@@ -33,17 +33,12 @@ from teamslam.team.estimation.map_joining.marginals import joint_cost, scale_of
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, Graph, add_submaps
 from teamslam.team.shapes import Float
 
-LEAST_LANDMARKS = 3
-"""Two landmarks have one invariant only, their distance."""
-LEAST_ROBOTS = 3
-"""Least number of robots in all worlds together."""
-FARTHEST_M = 1.0
-"""Largest distance of a measured landmark from its place."""
-SETTLED = 0.02
-"""Relative factor change that ends the iteration."""
+LEAST_LANDMARKS = 3  # two landmarks have one invariant only, their distance
+LEAST_ROBOTS = 3  # least number of robots in all worlds together
+FARTHEST_M = 1.0  # largest distance of a measured landmark from its place
+SETTLED = 0.02  # relative factor change that ends the iteration
 MOST_ROUNDS = 8
-APART = 2**40
-"""Offset of the single robot's landmark numbers, above all others."""
+APART = 2**40  # offset of the single robot's landmark numbers, above all others
 
 
 class _Disagreement(NamedTuple):

@@ -16,8 +16,7 @@ from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.wire import messages as m
 
 LARGEST_TURN_RAD = 0.35
-FASTEST_TURN_RAD_S = 3.0
-"""Turn rate above which a path has an interpolation fault near heading ±π."""
+FASTEST_TURN_RAD_S = 3.0  # turn rate above which a path has an interpolation fault near heading ±π
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,12 +186,9 @@ def true_paths(streams: Sequence[RobotStream]) -> dict[str, Path]:
     }
 
 
-SPAN_S = 10.0
-"""Stretch length [s]: errors of one command are correlated for seconds."""
-LEAST_SPANS = 30
-"""Least number of moving stretches of all robots together."""
-LEAST_WAY_M = 0.05
-"""Least logged path [m] of a moving stretch."""
+SPAN_S = 10.0  # stretch length [s]: errors of one command are correlated for seconds
+LEAST_SPANS = 30  # least number of moving stretches of all robots together
+LEAST_WAY_M = 0.05  # least logged path [m] of a moving stretch
 
 
 def too_short(stretches: int) -> str:

@@ -32,14 +32,11 @@ LEAST_SEEN = 3
 """Detections that exclude clutter. Only such landmarks define a scan's coverage, since clutter may
 lie beyond the visible range.
 """
-GROUPS = 5
-"""Number of stretches of windows left out in turn."""
+GROUPS = 5  # number of stretches of windows left out in turn
 ROUNDS = 200
 SETTLED = 1e-6
-DIFFERENT = 1.3
-"""Error ratio from which a claimed covariance is wrong."""
-UNLIKE = 0.1
-"""Reported difference in detection probability."""
+DIFFERENT = 1.3  # error ratio from which a claimed covariance is wrong
+UNLIKE = 0.1  # reported difference in detection probability
 
 UNITS = {
     "detection_probability": "",

@@ -15,8 +15,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.team.config import MotionModel, Sensor
 from teamslam.team.shapes import Float
 
-GROUPS = 5
-"""Least number of parts left out in turn."""
+GROUPS = 5  # least number of parts left out in turn
 
 HUBER = 2.0
 

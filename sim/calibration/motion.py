@@ -19,14 +19,11 @@ from teamslam.sim.calibration.data import (
 from teamslam.sim.calibration.figures import CalibrationError, huber
 from teamslam.team.shapes import Float
 
-STEPS = 40
-"""Steps of a span, each an arc (or rotation and chord) of the true path."""
+STEPS = 40  # steps of a span, each an arc (or rotation and chord) of the true path
 STEP_S = SPAN_S / STEPS
 ROUNDS = 4
-STANDING_M_S = 1e-3
-"""Speeds below this [m/s] count as standing."""
-FLOOR_VARIANCE = 1e-6
-"""Variance of a motionless span: a millimetre, a milliradian of the reference."""
+STANDING_M_S = 1e-3  # speeds below this [m/s] count as standing
+FLOOR_VARIANCE = 1e-6  # variance of a motionless span: a millimetre, a milliradian of the reference
 
 UNITS = {
     "forward_scale": "",
@@ -41,8 +38,7 @@ UNITS = {
     "lateral.per_m": "m/√m",
 }
 
-LEAST_SLOW_S = 20.0
-"""Least time [s] at low speed for its scale."""
+LEAST_SLOW_S = 20.0  # least time [s] at low speed for its scale
 
 Numbers = Float[np.ndarray, " p"]
 Pair = Float[np.ndarray, "2"]

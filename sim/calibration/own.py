@@ -22,8 +22,7 @@ from teamslam.team.shapes import Float
 LEAST_ROBOTS = 3
 LEAST_LANDMARKS = 4
 BEYOND_DOUBT = 0.99
-COMMON_DOF = 2
-"""Prior of the common range scale, as a number of further worlds."""
+COMMON_DOF = 2  # prior of the common range scale, as a number of further worlds
 BIAS_OF = {
     "bearing_offset": "bearing",
     "range_offset": "range_offset",

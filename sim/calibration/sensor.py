@@ -27,13 +27,10 @@ from teamslam.team.shapes import Float, Int64
 
 LEAST_MEASUREMENTS = 100
 ROUNDS = 4
-OUTLIER = 4.0
-"""Standard deviations beyond which measurements are outliers."""
+OUTLIER = 4.0  # standard deviations beyond which measurements are outliers
 MAD_TO_SIGMA = 1.4826
-LAGS_S = np.geomspace(0.1, 30.0, 9)
-"""Lag edges [s] of the error correlation of one landmark."""
-NEIGHBOURS = 64
-"""Largest index distance of paired measurements of a landmark."""
+LAGS_S = np.geomspace(0.1, 30.0, 9)  # lag edges [s] of the error correlation of one landmark
+NEIGHBOURS = 64  # largest index distance of paired measurements of a landmark
 
 UNITS = {
     "range_offset": "m",

@@ -15,8 +15,7 @@ from click.exceptions import Exit
 from teamslam.team.wire.text import printable_lines
 
 ARGUMENTS = "Arguments"
-OPTIONS = "Options"
-"""Section of the options that most users need."""
+OPTIONS = "Options"  # section of the options that most users need
 NETWORK = "Network and keys"
 RARE = "Rarely needed"
 LAST: Mapping[str, int] = MappingProxyType({RARE: 1, NETWORK: 2})
@@ -27,8 +26,7 @@ PLACEHOLDERS: Mapping[object, str] = MappingProxyType(
 """Placeholder of an option's value by its type, if the option has none."""
 WRONG_USE = 2
 FAILED = 1
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, by the shell's convention."""
+INTERRUPTED = 130  # exit status after Ctrl-C, by the shell's convention
 F = TypeVar("F", bound=Callable[..., None])
 
 

@@ -26,10 +26,8 @@ app = Group()
 
 _LOG = logging.getLogger("teamslam")
 WAIT_S = 0.2
-LAST_S = 0.2
-"""Time [s] for messages in transit at the end."""
-AT_ONCE = 500
-"""Measurements processed between checks for new messages."""
+LAST_S = 0.2  # time [s] for messages in transit at the end
+AT_ONCE = 500  # measurements processed between checks for new messages
 
 
 @app.declare("teamslam driver r1 --team lab --ros2 topics.toml --start 0,0,1.57")

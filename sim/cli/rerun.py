@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 app = Group()
 
 NETWORK_CHANGES = "Another network"
-OFFENDERS = 20
-"""Most printed violations; the JSON file has all."""
+OFFENDERS = 20  # most printed violations; the JSON file has all
 
 
 @app.declare("teamslam rerun runs/first --verify\nteamslam rerun runs/first --without r3")

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from teamslam.central.desk.report.run import Run
     from teamslam.team.recording.reader import Log
 
-PATIENCE_S = 3.0
-"""Time [s] between lines and before the first, so short work prints none."""
+PATIENCE_S = 3.0  # time [s] between lines and before the first, so short work prints none
 
 
 class Steps:

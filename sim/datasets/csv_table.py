@@ -16,15 +16,12 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 T = TypeVar("T")
 NANO = Decimal(10**9)
-SHOWN = 60
-"""Letters of a faulty cell or line in an error."""
-LARGEST_NAME = 2**31 - 1
-"""Largest number of a named landmark."""
+SHOWN = 60  # letters of a faulty cell or line in an error
+LARGEST_NAME = 2**31 - 1  # largest number of a named landmark
 
 
 POINT, COMMA = (re.compile(rf"[+-]?[0-9]*{mark}[0-9]+([eE][+-]?[0-9]+)?") for mark in (r"\.", ","))
-NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")
-"""Landmark name: a text with a final number."""
+NAMED = re.compile(r"([A-Za-z](?:.*[^0-9])?)([0-9]+)")  # landmark name: a text with a final number
 
 
 class UnknownColumnError(DatasetError):

@@ -17,8 +17,7 @@ from teamslam.team.shapes import Float, Int64, UInt32
 
 CLASS, RIGHT = "class", "class_probability"
 COLUMNS = ("t_s", *POLAR, *POLAR_COVARIANCE, "diameter_m", CLASS, RIGHT)
-USUAL_RIGHT = 0.95
-"""Probability that a class is right where the table states none."""
+USUAL_RIGHT = 0.95  # probability that a class is right where the table states none
 MOST_CLASSES = 64
 LABELS = ("landmark",)
 FILES = (DETECTIONS, "labels.csv")

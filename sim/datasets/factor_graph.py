@@ -20,13 +20,11 @@ from teamslam.sim.world.streams import (
 )
 from teamslam.team.shapes import Float
 
-STEP_NS = 1_000_000_000
-"""Time between two poses [ns] of a graph without times."""
+STEP_NS = 1_000_000_000  # time between two poses [ns] of a graph without times
 Pose = Float[np.ndarray, "3"]
 Point = Float[np.ndarray, "2"]
 Matrix = Float[np.ndarray, "n n"]
-Key = tuple[str, int]
-"""Robot and number of a pose."""
+Key = tuple[str, int]  # robot and number of a pose
 
 
 @dataclass(frozen=True)

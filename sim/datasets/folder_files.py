@@ -10,12 +10,9 @@ from teamslam.sim.datasets.tables import DatasetError, File, open_place
 from teamslam.team.keys.roster import ROBOT
 
 ROBOT_NAME = ROBOT.pattern
-STREAM_FILES = ("odometry.csv", "observations.csv")
-"""Files that mark a robot's folder."""
-DETECTIONS = "detections.csv"
-"""A robot's detections without identities."""
-ONE_ROBOT = "r1"
-"""Name of a robot with tables in the data set's own folder."""
+STREAM_FILES = ("odometry.csv", "observations.csv")  # files that mark a robot's folder
+DETECTIONS = "detections.csv"  # a robot's detections without identities
+ONE_ROBOT = "r1"  # name of a robot with tables in the data set's own folder
 SCENARIO = "scenario.toml"
 EXPECTED = (
     "expected a folder with a sub-folder for each robot, named as in r1, with odometry.csv and "

@@ -27,20 +27,16 @@ from teamslam.team.shapes import Bool, Float, Int64
 FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)
 MIXED = ((SPEEDS, INCREMENTS), (STEERED, INCREMENTS))
 LONG_GAP_NS = 2_000_000_000
-JUMP_NS = 86_400 * 10**9
-"""Longest step between rows without a clock jump."""
-PACE = "most rows of its odometry are"
-"""Prefix of the note on times in other units."""
+JUMP_NS = 86_400 * 10**9  # longest step between rows without a clock jump
+PACE = "most rows of its odometry are"  # prefix of the note on times in other units
 WHIRLING_RAD_S = 10.0
 """Yaw rate [rad/s] above which radians are improbable. Ground robots turn by 1 to 5 rad/s at most;
 in degrees even a slow turn of 10 °/s exceeds it.
 """
 LEAST_WHIRLS, WHIRLS = 2, 0.01
 """Number and share of the stretches of 1 s in which a robot must turn faster than that."""
-SHORTEST_S, LONGEST_S = 1e-4, 5.0
-"""Plausible median odometry interval in seconds."""
-IMPOSSIBLE_S = 60.0
-"""Median odometry interval [s] of no robot."""
+SHORTEST_S, LONGEST_S = 1e-4, 5.0  # plausible median odometry interval in seconds
+IMPOSSIBLE_S = 60.0  # median odometry interval [s] of no robot
 LEAST_OTHERS, MOST_OTHERS = 2, 0.1
 """Number and share of rows that may have the time of another row and other values."""
 OFF_NS = 1_000_000

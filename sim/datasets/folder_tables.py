@@ -31,14 +31,10 @@ NOT_A_COVARIANCE = (
 )
 EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
-EARLY_NS = 2_000_000_000
-"""Longest time by which measurements may precede odometry, at standstill."""
-FAR_M = 1_000.0
-"""Median range [m] above which metres are improbable."""
-LEAST_BELOW, MOST_BELOW = 2, 0.1
-"""Number and share of ranges that may be below 0 by chance."""
-MOST_RAD = 2.0 * np.pi + 1e-3
-"""Largest bearing that can be in radians."""
+EARLY_NS = 2_000_000_000  # longest time by which measurements may precede odometry, at standstill
+FAR_M = 1_000.0  # median range [m] above which metres are improbable
+LEAST_BELOW, MOST_BELOW = 2, 0.1  # number and share of ranges that may be below 0 by chance
+MOST_RAD = 2.0 * np.pi + 1e-3  # largest bearing that can be in radians
 
 CHORD_M, LEAST_CHORDS = 0.2, 20
 """Length of a path's chords [m], and the least number that shows the unit of its headings."""

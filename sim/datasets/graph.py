@@ -100,10 +100,8 @@ GRAPH_FORMS = {
         POINT_EDGES, _Form(2, (5, 2), "pose landmark x y and three numbers of the information")
     ),
 }
-TRUTH = "_groundtruth"
-"""Ending of the name of a file's errorless twin."""
-HEAD = 65_536
-"""Bytes in which a graph's first keyword is."""
+TRUTH = "_groundtruth"  # ending of the name of a file's errorless twin
+HEAD = 65_536  # bytes in which a graph's first keyword is
 
 
 class _Line(NamedTuple):

@@ -9,8 +9,7 @@ import numpy as np
 
 from teamslam.team.shapes import Float
 
-LARGEST = 4e9
-"""Largest number of a data set: the time of the year 2096."""
+LARGEST = 4e9  # largest number of a data set: the time of the year 2096
 
 File = Path | zipfile.Path
 

@@ -62,8 +62,7 @@ def _erratum_of(
     return ERRATA.get(content_digest(barcodes, landmarks))
 
 
-ROBOTS = 5
-"""Subjects 1 … 5 are robots, even without files; landmarks follow."""
+ROBOTS = 5  # subjects 1 … 5 are robots, even without files; landmarks follow
 
 BARCODES = ("subject", "barcode")
 SURVEY = ("subject", "x [m]", "y [m]", "x std-dev [m]", "y std-dev [m]")
@@ -236,14 +235,11 @@ def _start(world: UtiasWorld, robot: str, pose: Float[np.ndarray, "3"] | None) -
     return StartPose(pose, np.diag(sigmas**2))
 
 
-LONG_GAP_NS = 2_000_000_000
-"""Least reported gap in odometry or truth."""
+LONG_GAP_NS = 2_000_000_000  # least reported gap in odometry or truth
 
-START_WINDOW_NS = 200_000_000
-"""Time around a robot's first measurement for its initial pose."""
+START_WINDOW_NS = 200_000_000  # time around a robot's first measurement for its initial pose
 
-START_SPREAD_RAD = 0.2
-"""Largest heading difference [rad] within that time."""
+START_SPREAD_RAD = 0.2  # largest heading difference [rad] within that time
 
 
 def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
@@ -355,8 +351,7 @@ def _sort_by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N 
 
 Row = tuple[str | float, ...]
 
-FIRST_BARCODE = 100
-"""Subject k has barcode 100 + k."""
+FIRST_BARCODE = 100  # subject k has barcode 100 + k
 
 
 def write_utias(streams: WorldStreams, directory: Path | str) -> None:

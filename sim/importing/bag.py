@@ -32,12 +32,10 @@ POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceS
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 FIX = "sensor_msgs/msg/NavSatFix"
 WHEEL_WORDS = ("wheel", "wheels", "encoder", "encoders", "raw", "controller", "drive")
-FILTERED = ("filtered", "fused", "ekf", "ukf")
-"""Words for fixes that contain odometry."""
+FILTERED = ("filtered", "fused", "ekf", "ukf")  # words for fixes that contain odometry
 PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
 """Initial topic words that name a part of a robot, not a robot."""
-SAMPLED_MESSAGES = 2000
-"""Number of /tf messages searched for tags."""
+SAMPLED_MESSAGES = 2000  # number of /tf messages searched for tags
 
 
 class _UndecidedError(DatasetError):

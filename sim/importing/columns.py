@@ -61,8 +61,7 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     drop: dict[str, tuple[str, ...]] = {}
 
 
-Map = dict[str, Table]
-"""Tables of one robot by kind."""
+Map = dict[str, Table]  # tables of one robot by kind
 
 
 class ColumnMap(msgspec.Struct, frozen=True):

@@ -36,8 +36,7 @@ from teamslam.sim.importing.tables import RobotTables
 from teamslam.sim.world.streams import polar_covariances
 from teamslam.team.shapes import Float
 
-QUATERNION = 8
-"""Columns of a TUM trajectory: t x y z qx qy qz qw."""
+QUATERNION = 8  # columns of a TUM trajectory: t x y z qx qy qz qw
 
 
 def read_files(paths: Sequence[Path], *, tum: bool) -> dict[str, CsvTable]:

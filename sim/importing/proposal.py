@@ -57,13 +57,10 @@ UNITS = {
     "rps": "1", "deg_s": DEGREE, "deg_sec": DEGREE, "dps": DEGREE,
 }  # fmt: skip
 """Factor to our unit, by the unit at the end of a column name."""
-LARGEST_S = 1e11
-"""Times from here on are no seconds."""
-MOST_ROBOTS = 100
-"""More values of a column are no names of robots."""
+LARGEST_S = 1e11  # times from here on are no seconds
+MOST_ROBOTS = 100  # more values of a column are no names of robots
 _NONE: Mapping[str, Any] = MappingProxyType({})
-KIND = "<kind>"
-"""Placeholder of a table's name."""
+KIND = "<kind>"  # placeholder of a table's name
 PROPOSED = (*MEASURED, "truth", "landmarks", "start")
 FILE_NAMES: Mapping[str, Sequence[str]] = {
     "odometry": ("odom", "wheel", "encoder"),
@@ -97,8 +94,7 @@ class _Proposed(NamedTuple):
     text: str
 
 
-Files = Mapping[str, CsvTable]
-"""Tables of one robot by file name."""
+Files = Mapping[str, CsvTable]  # tables of one robot by file name
 
 
 Drops = Mapping[str, Mapping[str, str]]

@@ -41,8 +41,7 @@ from teamslam.team.ros2.bags import BagError, is_bag
 from teamslam.team.ros2.topics import TopicsError, load_topics
 
 TEAM_PROFILE, ROS2_PROFILE = b"teamslam", b"ros2"
-HEAD = 64
-"""Bytes that contain an MCAP file's profile."""
+HEAD = 64  # bytes that contain an MCAP file's profile
 
 
 @dataclass(frozen=True)

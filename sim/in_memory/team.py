@@ -22,10 +22,8 @@ from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, o
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration
 
-RESEND_NS = 1_000_000_000
-"""A lost submap is sent again after this time."""
-PATIENCE_NS = 3_000_000_000
-"""Time after which the centre considers a robot lost."""
+RESEND_NS = 1_000_000_000  # a lost submap is sent again after this time
+PATIENCE_NS = 3_000_000_000  # time after which the centre considers a robot lost
 _FROM_ROBOTS = (ch.SUBMAP, ch.SIGHTING_FACTOR, ch.OWN_MAP, ch.ROBOT_PROGRESS, ch.ROBOT_DONE)
 _FROM_CENTRE = (ch.FUSED_MAP, ch.PRIOR, ch.FINAL_MAP, ch.CENTRAL_PROGRESS)
 
@@ -155,8 +153,7 @@ ROUND_S = 1.0
 real time.
 """
 
-SHARED = 16
-"""Number of recent samples whose decoded messages are cached."""
+SHARED = 16  # number of recent samples whose decoded messages are cached
 
 
 @runtime_checkable

@@ -60,12 +60,9 @@ class Plan:
         return sorted(self.folder.glob(self.set_file("*").name))
 
 
-ROUTER_PATIENCE_S = 20.0
-"""Time [s] within which the router reports its endpoint."""
-POSES = (ch.OWN_POSE, ch.TEAM_POSE)
-"""Channels that may lose messages to a slow observer."""
-REFUSED = 2
-"""Exit status for an impossible request."""
+ROUTER_PATIENCE_S = 20.0  # time [s] within which the router reports its endpoint
+POSES = (ch.OWN_POSE, ch.TEAM_POSE)  # channels that may lose messages to a slow observer
+REFUSED = 2  # exit status for an impossible request
 
 
 class LaunchError(RuntimeError):

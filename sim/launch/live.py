@@ -23,12 +23,9 @@ from teamslam.team.wire import messages as m
 if TYPE_CHECKING:
     from teamslam.sim.launch.live_errors import LiveErrors
 
-AHEAD_S = 10.0
-"""Smallest reported lead of the world over the map [s]."""
-NAMED = 5
-"""Most missing robots that are named."""
-PATIENCE_S = 8.0
-"""Time [s] before absent nodes are reported."""
+AHEAD_S = 10.0  # smallest reported lead of the world over the map [s]
+NAMED = 5  # most missing robots that are named
+PATIENCE_S = 8.0  # time [s] before absent nodes are reported
 
 
 def _count_consumed(watch: Watch) -> tuple[float, float]:
@@ -128,14 +125,10 @@ def consistency(watch: Watch) -> str:
     return ", ".join(parts)
 
 
-LINE_S = 5.0
-"""Wall time between plain lines."""
-REPEAT_S = 60.0
-"""Wall time after which an unchanged line is repeated."""
-SETTLED_S = 5.0
-"""A warning withdrawn within this time [s] is not printed."""
-MOST_ALIKE = 3
-"""Most lines of warnings that differ in their numbers only."""
+LINE_S = 5.0  # wall time between plain lines
+REPEAT_S = 60.0  # wall time after which an unchanged line is repeated
+SETTLED_S = 5.0  # a warning withdrawn within this time [s] is not printed
+MOST_ALIKE = 3  # most lines of warnings that differ in their numbers only
 _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
@@ -271,10 +264,8 @@ _LEFT_OUT_FIRST = ("messages_per_s", "bytes_per_s", "landmarks")
 """Columns left out, in this order, until the table fits the terminal."""
 _PEER_HEADINGS = ("set\nhere", "oldest\n[s]", "same\nset")
 _NEWEST = "set_newest_s."
-_SHOWN_AT_MOST = 12
-"""Most robots with a row each."""
-UNBOUNDED = 1000
-"""Terminal columns in which a table takes all that it needs."""
+_SHOWN_AT_MOST = 12  # most robots with a row each
+UNBOUNDED = 1000  # terminal columns in which a table takes all that it needs
 
 
 def _robots(statuses: Mapping[str, m.Status], errors: "LiveErrors", width: int) -> Table:

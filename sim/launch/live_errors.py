@@ -12,8 +12,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 
-EVERY_NS = 1_000_000_000
-"""Least team time between a robot's compared poses."""
+EVERY_NS = 1_000_000_000  # least team time between a robot's compared poses
 
 
 @dataclass

@@ -21,11 +21,9 @@ ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 """Environment that gives linear algebra one thread."""
-LOOK_S = 0.005
-"""Time [s] between checks of an ending process."""
+LOOK_S = 0.005  # time [s] between checks of an ending process
 LAST_LINES = 12
-GRACE_S = 5.0
-"""Time [s] for a requested stop."""
+GRACE_S = 5.0  # time [s] for a requested stop
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,9 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, BusError, Outgoing
 
-FRUITLESS = 5
-"""Consecutive deaths without progress before a process is given up."""
+FRUITLESS = 5  # consecutive deaths without progress before a process is given up
 FIRST_WAIT_S = 0.2
-LONGEST_WAIT_S = 5.0
-"""Longest wait [s] before a restart."""
+LONGEST_WAIT_S = 5.0  # longest wait [s] before a restart
 
 
 @dataclass
@@ -85,20 +83,14 @@ class Supervised:
             )
 
 
-SILENT_S = 10.0
-"""Silence [s] after which a running process is reported."""
-FEW = 3
-"""Above this number, silent processes are only counted."""
+SILENT_S = 10.0  # silence [s] after which a running process is reported
+FEW = 3  # above this number, silent processes are only counted
 COMPUTING = "is computing"
 MANY = "many"
-REPEAT_S = 60.0
-"""Least time [s] between reports of the same silence."""
-STARTING_S = 60.0
-"""Silence [s] after which a starting process is reported."""
-MEASURE_S = 2.0
-"""Time [s] between memory measurements; the last is at the final map."""
-END_DELAY_S = 1.0
-"""Time [s] after a process's end for the final map to arrive."""
+REPEAT_S = 60.0  # least time [s] between reports of the same silence
+STARTING_S = 60.0  # silence [s] after which a starting process is reported
+MEASURE_S = 2.0  # time [s] between memory measurements; the last is at the final map
+END_DELAY_S = 1.0  # time [s] after a process's end for the final map to arrive
 LEAVING_S = 60.0
 """After the final map, a process is ended and reported if for this long [s] no other has ended and
 the recorder has received nothing.

@@ -20,16 +20,12 @@ if TYPE_CHECKING:
     from teamslam.team.keys.signing import Signer
 
 TURN_S = 0.1
-DRIVERS = "drivers"
-"""Node name of all drivers of a live team."""
-UNIX_S = 1e9
-"""Team times from here on are Unix times: 1e9 s is in 2001."""
-SILENT_S = 10.0
-"""Driver silence [s] that is reported; a status is due each second."""
+DRIVERS = "drivers"  # node name of all drivers of a live team
+UNIX_S = 1e9  # team times from here on are Unix times: 1e9 s is in 2001
+SILENT_S = 10.0  # driver silence [s] that is reported; a status is due each second
 COMPARED = (ch.START, ch.TRUTH, ch.TRUTH_LANDMARKS, ch.OWN_POSE, ch.TEAM_POSE)
 """Channels of `LiveErrors`, besides the fused map's."""
-_PROGRESS = ("measurements", "submaps", "messages")
-"""Status figures that grow with progress."""
+_PROGRESS = ("measurements", "submaps", "messages")  # status figures that grow with progress
 
 
 @dataclass

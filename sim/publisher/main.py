@@ -15,8 +15,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing
 from teamslam.team.wire.digest import announce_configuration
 
-PACE_S = 0.002
-"""Wait [s] for the clock or credit."""
+PACE_S = 0.002  # wait [s] for the clock or credit
 _LOG = logging.getLogger("teamslam")
 
 

@@ -24,8 +24,7 @@ from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded
 
-SHOWN = 3
-"""Most differing fields in a warning."""
+SHOWN = 3  # most differing fields in a warning
 REMEDY = "start it again with the same scenario and options"
 
 
@@ -96,10 +95,8 @@ def _fields(value: Any, at: str = "") -> Iterator[tuple[str, str]]:
         yield at, json.dumps(value)
 
 
-BLOCKED_S = 5.0
-"""Duration [s] of missing credit after which a node is named in the status."""
-RESUME_S = 2.0
-"""Wait [s] of a restarted world for all progress reports."""
+BLOCKED_S = 5.0  # duration [s] of missing credit after which a node is named in the status
+RESUME_S = 2.0  # wait [s] of a restarted world for all progress reports
 
 
 @dataclass

@@ -23,8 +23,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Answer, Bus, Outgoing, Sample, Tap
 from teamslam.team.wire.codec import WireError, decoded, encoded
 
-PERIOD_NS = 1_000_000_000
-"""Team time [ns] of constant reach."""
+PERIOD_NS = 1_000_000_000  # team time [ns] of constant reach
 
 
 @dataclass(frozen=True)

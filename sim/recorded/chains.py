@@ -31,8 +31,7 @@ _TAKEN = frozenset(
 _ENDLESS_S = 1e9
 
 
-JITTER_NS = 1_000_000
-"""Gap [ns] beyond which an odometry interval is missing."""
+JITTER_NS = 1_000_000  # gap [ns] beyond which an odometry interval is missing
 
 
 class BatchReferenceError(RuntimeError):

@@ -29,8 +29,7 @@ from teamslam.team.wire.bus import Sample, try_open
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of
 
-Span = tuple[float, float]
-"""Begin and end in seconds since the log's first measurement."""
+Span = tuple[float, float]  # begin and end in seconds since the log's first measurement
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -185,8 +185,7 @@ def _sound(log: Log) -> Iterator[m.Message]:
             continue  # every node rejects it, too; `teamslam log check` counts it
 
 
-LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"
-"""Names of robots in pyfg, where L is a landmark's."""
+LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"  # names of robots in pyfg, where L is a landmark's
 
 
 def g2o_lines(graph: FactorGraph) -> Iterator[str]:

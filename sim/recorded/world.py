@@ -21,8 +21,7 @@ from teamslam.team.wire.channels import Channel, channel_of
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.digest import announce_configuration
 
-STEP_NS = 1_000_000_000
-"""Team time between two checks of the nodes' answers."""
+STEP_NS = 1_000_000_000  # team time between two checks of the nodes' answers
 _TRUTH = (ch.TRUTH, ch.TRUTH_LANDMARKS, ch.TRUTH_LABELS, ch.TRUTH_POSITIONS)
 _SOURCE = (*ch.SENSORS, *_TRUTH, ch.WORLD_CONFIG, ch.SAVED_MAP, ch.END)
 

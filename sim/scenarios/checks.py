@@ -19,8 +19,7 @@ _IN_WORDS = {
 }
 
 
-LARGEST_SIGMA_RAD = 0.5
-"""Bearing standard deviation [rad] above which degrees are probable."""
+LARGEST_SIGMA_RAD = 0.5  # bearing standard deviation [rad] above which degrees are probable
 
 
 class ScenarioError(ValueError):

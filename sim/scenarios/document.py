@@ -22,12 +22,10 @@ from teamslam.team.config import RobotConfig
 if TYPE_CHECKING:
     import zipfile
 
-BUILTIN = Path(__file__).with_name("builtin")
-"""Folder of the installed scenarios."""
+BUILTIN = Path(__file__).with_name("builtin")  # folder of the installed scenarios
 MAX_ROBOTS = 1_000
 UTIAS_ROBOTS = 5
-ANY_ROBOT = "any_robot"
-"""Placeholder for each robot of an unread data set."""
+ANY_ROBOT = "any_robot"  # placeholder for each robot of an unread data set
 
 Fields = dict[str, Any]
 

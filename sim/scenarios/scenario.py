@@ -51,8 +51,7 @@ __all__ = ["ASSUMED_NAME", "Scenario", "ScenarioError", "builtin_names", "dumps"
 
 ASSUMED_NAME = "recorded"
 """Built-in scenario for recorded data of uncalibrated robots; the team is named by its data set."""
-FAR_M = 10.0
-"""Default end of a sensor's range."""
+FAR_M = 10.0  # default end of a sensor's range
 PASSED = 0.5
 """Distance, as a share of a sensor's range, from which a robot that drives past a landmark has most
 of its information about it.

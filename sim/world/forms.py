@@ -116,8 +116,7 @@ def _wheel_errors(
 
 Rows = Float[np.ndarray, "K 3"]
 
-LARGEST_CORRELATION = 0.8
-"""Largest absolute range-bearing correlation of a carried covariance."""
+LARGEST_CORRELATION = 0.8  # largest absolute range-bearing correlation of a carried covariance
 
 
 def seen_from(poses: Rows, mount: tuple[float, float, float]) -> Rows:

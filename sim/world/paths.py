@@ -17,8 +17,7 @@ Kind = Literal["turn-then-drive", "velocity", "differential-drive", "ackermann"]
 Pose = tuple[float, float, float]
 Step = tuple[float, float]
 
-ALIGNED_RAD = 0.02
-"""Largest heading error at which a robot that turns first begins to drive."""
+ALIGNED_RAD = 0.02  # largest heading error at which a robot that turns first begins to drive
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,9 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.shapes import Float, Int64, UInt32
 
-SHORTEST_MEASUREMENT_M = 0.05
-"""Least measured range [m]."""
+SHORTEST_MEASUREMENT_M = 0.05  # least measured range [m]
 
-SHORTEST_TIME_S = 1e-9
-"""Least correlation time [s]; shorter means uncorrelated."""
+SHORTEST_TIME_S = 1e-9  # least correlation time [s]; shorter means uncorrelated
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,7 @@ from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.core import atan2, hypot
 from teamslam.team.shapes import Float, Int64, UInt32
 
-LEAST_RADIUS = 1.5
-"""Turning radius of a simulated car, in wheel bases."""
+LEAST_RADIUS = 1.5  # turning radius of a simulated car, in wheel bases
 
 
 def simulate(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) -> WorldStreams:
@@ -382,8 +381,7 @@ def _span(world: SimulatedWorld, sensor: Sensor) -> tuple[float, float]:
     return nearest, max(nearest, min(farthest, across))
 
 
-INNER = 0.1
-"""Least wall distance of a landmark, as a share of a room's side."""
+INNER = 0.1  # least wall distance of a landmark, as a share of a room's side
 
 
 def _laid_out(world: SimulatedWorld, rng: np.random.Generator) -> Float[np.ndarray, "L 2"]:

@@ -16,8 +16,7 @@ OBSERVATIONS = 1
 SIGHTINGS = 2
 FIXES = 3
 ODOMETRY = 4
-NO_LABEL = 2**32 - 1
-"""Identity of clutter, or of an unknown landmark."""
+NO_LABEL = 2**32 - 1  # identity of clutter, or of an unknown landmark
 
 
 @dataclass(frozen=True)

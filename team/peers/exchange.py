@@ -18,14 +18,10 @@ from teamslam.team.peers.replica import (
 from teamslam.team.store import Stream
 from teamslam.team.wire import messages as m
 
-MOST_REQUESTED = 64
-"""Most intervals per request."""
-MOST_ASKED = 512
-"""Most submaps per request."""
-ANSWER_BYTES = 1 * 2**20
-"""Most bytes of members per answer, unless a single member is larger."""
-BATCH_BYTES = 64 * 2**10
-"""Bytes of members per message of an answer."""
+MOST_REQUESTED = 64  # most intervals per request
+MOST_ASKED = 512  # most submaps per request
+ANSWER_BYTES = 1 * 2**20  # most bytes of members per answer, unless a single member is larger
+BATCH_BYTES = 64 * 2**10  # bytes of members per message of an answer
 
 
 def make_request(

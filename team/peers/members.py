@@ -12,10 +12,8 @@ STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)
 STATED = (
     ch.ROBOT_DONE, ch.ORDER, ch.GIVEN_UP, ch.VERDICT, ch.SAVED_MAP, ch.CONCLUDED, ch.CERTIFICATE,
 )  # fmt: skip
-CHANNELS = (*STREAMED, *STATED)
-"""Channels whose messages are members."""
-LARGEST_MEMBER = 4 * 2**20
-"""Most bytes of a member; a submap of 1000 landmarks has 2·10⁶."""
+CHANNELS = (*STREAMED, *STATED)  # channels whose messages are members
+LARGEST_MEMBER = 4 * 2**20  # most bytes of a member; a submap of 1000 landmarks has 2·10⁶
 LARGEST_SIGNATURE = 8192
 """Most bytes of a member's signature; an operator's includes its certificate."""
 

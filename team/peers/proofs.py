@@ -15,15 +15,11 @@ from teamslam.team.wire import messages as m
 if TYPE_CHECKING:
     from teamslam.team.keys.signing import Signer
 
-MOST_SIGNATURES = 250_000
-"""Most signatures stored per node; a robot has one per member."""
-LARGEST_OF_ROBOT = 80
-"""Most bytes of a robot's signature: ECDSA over P-256 has 72 at most."""
-MOST_OF_OPERATOR = 10_000
-"""Most stored signatures of operators."""
+MOST_SIGNATURES = 250_000  # most signatures stored per node; a robot has one per member
+LARGEST_OF_ROBOT = 80  # most bytes of a robot's signature: ECDSA over P-256 has 72 at most
+MOST_OF_OPERATOR = 10_000  # most stored signatures of operators
 OPERATOR = "operator"
-ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)
-"""Members that operators sign."""
+ORDERS = (m.Withdrawal, m.GivenUp, m.Verdict)  # members that operators sign
 
 
 class Proofs:

@@ -18,24 +18,18 @@ from teamslam.team.wire.intervals import IntervalSet
 
 MOST_SEQUENCES = 200_000
 MOST_STREAMS = 64
-MOST_STATEMENTS = 2 * MOST_STREAMS + 8
-"""Most orders and `Done` messages about one robot."""
-MOST_VERDICTS = 4096
-"""Most verdicts on landmarks of one robot, and withdrawals of verdicts."""
-MOST_MAPS = 16
-"""Most saved maps of earlier days."""
-SHARE = 256 * 2**20
-"""Most bytes about one robot: 8 h of a submap of 4 kB every half second."""
+MOST_STATEMENTS = 2 * MOST_STREAMS + 8  # most orders and `Done` messages about one robot
+MOST_VERDICTS = 4096  # most verdicts on landmarks of one robot, and withdrawals of verdicts
+MOST_MAPS = 16  # most saved maps of earlier days
+SHARE = 256 * 2**20  # most bytes about one robot: 8 h of a submap of 4 kB every half second
 MOST_INTERVALS = 64
 """Most intervals of a stream in a summary; later ones follow once gaps have closed."""
-MOST_LOOKS = 1024
-"""Most inter-robot measurements from one submap."""
+MOST_LOOKS = 1024  # most inter-robot measurements from one submap
 _WORD = 2**256
 K = TypeVar("K")
 
 Outcome = Literal["new", "known", "replaced"]
-TeammateAt = tuple[int, str]
-"""(stamp, teammate) of an inter-robot measurement."""
+TeammateAt = tuple[int, str]  # (stamp, teammate) of an inter-robot measurement
 
 
 class RefusedError(ValueError):

@@ -25,13 +25,10 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.intervals import IntervalSet, describe_intervals
 
 MAGIC = b"tmsset1\n"
-RETRY_S = 5.0
-"""Interval [s] between attempts to write after an error."""
+RETRY_S = 5.0  # interval [s] between attempts to write after an error
 _HEAD = struct.Struct("<II")
-_BODY = b"\x93"
-"""First byte of each body: an array of three."""
-_LEAST = 4
-"""Fewest bytes of a body: the array and three empty values."""
+_BODY = b"\x93"  # first byte of each body: an array of three
+_LEAST = 4  # fewest bytes of a body: the array and three empty values
 _LOG = logging.getLogger("teamslam")
 _LARGEST = LARGEST_MEMBER + 2**16
 

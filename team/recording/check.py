@@ -20,8 +20,7 @@ from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open
 from teamslam.team.wire.codec import WireError
 
 FILE = "file"  # place of a finding without a key
-MOST_HOLES = 5
-"""Most gaps of a log that are printed; `teamslam log check` prints all."""
+MOST_HOLES = 5  # most gaps of a log that are printed; `teamslam log check` prints all
 
 
 class Finding(NamedTuple):

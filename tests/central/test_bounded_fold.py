@@ -24,8 +24,7 @@ SUBMAPS = Submaps([stream(name, 40, y=y) for name, y in (("r1", 0.0), ("r2", 1.0
 SMALL = Limits(begin=6, lag=2, first=1)
 """Two submaps of each stream stay raw, beyond six in all; at 9 and at 13 all is linearised again.
 Landmarks rest from the first one on."""
-LATER_NS = 40_000_000_000
-"""End of the streams; a robot that appears then."""
+LATER_NS = 40_000_000_000  # end of the streams; a robot that appears then
 
 
 def fresh(bounded=True):

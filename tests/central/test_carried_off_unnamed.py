@@ -22,8 +22,7 @@ from tests.trials.stress_world import CarriedOff, StressWorld, write
 AT_S = 100.0
 FAR = CarriedOff("r2", 15.0, 2.0, AT_S)
 NEAR = CarriedOff("r2", 2.2, 0.5, AT_S)
-INSIDE = CarriedOff("r2", 15.0, 2.0, AT_S + 4.3)
-"""Inside a window of ten seconds."""
+INSIDE = CarriedOff("r2", 15.0, 2.0, AT_S + 4.3)  # inside a window of ten seconds
 
 
 class Run:

@@ -13,8 +13,7 @@ from tests.teams import Submaps, of, published, stream
 
 STREAMS = {name: stream(name, 15, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 SUBMAPS = Submaps(list(STREAMS.values()))
-FALSE = 9
-"""The name of a landmark that is not there."""
+FALSE = 9  # the name of a landmark that is not there
 END_NS = 15_000_000_000
 
 

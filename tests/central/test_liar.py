@@ -28,8 +28,7 @@ from tests.central.test_withdrawal import messages, of_set, scenario, team_run
 LIES = ("still", "micrometre", "far", "modest", "swap")
 """It never moved; its landmarks lie 2 m off, or 100 km, with sigmas of 1 µm; 1 m off with 5 cm;
 their names are exchanged."""
-BEFORE = 3
-"""Number of a liar's first submaps that are true."""
+BEFORE = 3  # number of a liar's first submaps that are true
 
 
 def lie(true: m.Submap, base: m.Submap, kind: str) -> m.Submap:

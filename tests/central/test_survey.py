@@ -20,8 +20,7 @@ from tests.scenarios import final_only, with_world
 from tests.sim.reruns import check_recomputed
 
 SIGMA_M = 0.05
-UTM = (399_000.0, 5_756_000.0)
-"""An origin of the survey far from the site, as in a national grid."""
+UTM = (399_000.0, 5_756_000.0)  # an origin of the survey far from the site, as in a national grid
 
 
 @cache

@@ -21,8 +21,7 @@ from tests.teams import config, published, stream
 STEPS = 9
 PATH_Y = {"alpha": 0.0, "bravo": 1.0, "charlie": -1.0}
 """The robots drive along the x axis, each on its own line, and see the same five landmarks."""
-OWN_IDS = 100
-"""Added to the landmark ids of a robot that has none in common with the others."""
+OWN_IDS = 100  # added to the landmark ids of a robot that has none in common with the others
 _STREAMS: dict[tuple[str, bool, bool], list[m.Measurement]] = {}
 
 

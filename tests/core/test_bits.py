@@ -16,8 +16,7 @@ from teamslam.team import core
 from tests.support import ROOT
 
 FOLDER = ROOT / "team" / "core"
-LIBRARIES = Path(core.__file__).parent
-"""Elsewhere than the sources where a wheel is tested."""
+LIBRARIES = Path(core.__file__).parent  # elsewhere than the sources where a wheel is tested
 PROGRAMS = {
     "bits": (
         "8c51871c169fc457 238a4106659bd483",

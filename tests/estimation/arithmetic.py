@@ -11,8 +11,7 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.estimation import dense
 
-SIZES = (3, 40, 130)
-"""Dense matrices: by loops, by a part of a tile, by several tiles and blocks."""
+SIZES = (3, 40, 130)  # dense matrices: by loops, by a part of a tile, by several tiles and blocks
 
 
 def digests() -> dict[str, str]:

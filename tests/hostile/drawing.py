@@ -28,8 +28,7 @@ CONFIG = bytes(8)
 SCALES = (0.0, 1e-300, 1e-12, 1e-6, 1e-3, 1.0, 1.0, 1.0, 30.0, 1e3, 1e6, 1e9, 1e15, 1e200)
 SIGMAS = (1e-150, 1e-30, 1e-9, 1e-6, 1e-3, 0.1, 0.1, 0.1, 1.0, 30.0, 1e3, 1e6, 1e12, 1e140)
 ROBOTS = ("r1", "r2", "r3")
-PAIR = ("r1", "r2")
-"""The robots of the scenario that real processes run."""
+PAIR = ("r1", "r2")  # the robots of the scenario that real processes run
 OF_THE_RUN = (
     m.FusedMap, m.End, m.Done, m.Withdrawal, m.WithdrawalHeard, m.GivenUp, m.TeamEnd, m.StreamHead,
     m.Fault,
@@ -382,8 +381,7 @@ def mutated(rng: Random, payload: bytes) -> bytes:
     return bytes(data)
 
 
-NUMBERS = (0, 1, 2, 7, 2**16, 2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1)
-"""Ids and counts: 32 bits."""
+NUMBERS = (0, 1, 2, 7, 2**16, 2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1)  # ids and counts: 32 bits
 INTEGERS = (*NUMBERS, 2**40, 2**53, 2**62 - 1, 2**63 - 1, -1, -(2**62))
 FLOATS = (0.0, -0.0, 1.0, -1.0, 5e-324, 1e-300, 1e-12, 3.2, 1e9, -1e9, 1e154, 1e300, -1e300)
 ESCAPES = ("\x1b]0;owned\x07", "\x1b[2J", "\u202e\u2066")

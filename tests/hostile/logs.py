@@ -21,8 +21,7 @@ from tests.support import packed, spd
 
 LARGEST_FILE = 16 * 1024
 NOISE = 4500
-PRIVATE = 0x90
-"""An opcode of nobody's, which readers skip."""
+PRIVATE = 0x90  # an opcode of nobody's, which readers skip
 DIGEST = b"configur"
 
 

@@ -36,10 +36,8 @@ from tests.hostile.drawing import CHANNELS, ROBOTS, S, mutated
 from tests.hostile.drawing import extreme_samples as samples
 
 COUNT = int(os.environ.get("TEAMSLAM_STORM", "6"))
-MOST_MIB = 150
-"""Growth of the process over all messages of one type."""
-MOST_S = 10.0
-"""CPU time of all messages of one type at one node."""
+MOST_MIB = 150  # growth of the process over all messages of one type
+MOST_S = 10.0  # CPU time of all messages of one type at one node
 Node = RobotNode | CentralNode | PeerCentre | PeerRobot
 ROBOT = RobotConfig("r1", front_end=FrontEnd(particles=10, window_s=10.0))
 NODES: dict[str, Callable[[], Node]] = {

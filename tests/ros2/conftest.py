@@ -3,8 +3,7 @@ import socket
 import pytest
 import zenoh
 
-Network = tuple[zenoh.Session, str]
-"""The router's session and its endpoint."""
+Network = tuple[zenoh.Session, str]  # the router's session and its endpoint
 
 
 @pytest.fixture

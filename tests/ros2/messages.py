@@ -11,8 +11,7 @@ from teamslam.team.ros2.definitions import types
 STORE = types()
 T: Any = STORE.types
 ZERO = np.zeros(36)
-Message = tuple[int, str, str, Any]
-"""Time of arrival, topic, type, message."""
+Message = tuple[int, str, str, Any]  # time of arrival, topic, type, message
 
 
 def header(stamp_ns: int, frame: str) -> Any:

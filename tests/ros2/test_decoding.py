@@ -14,8 +14,7 @@ AT = 1_700_000_000_123_456_789
 T = ros.T
 ODOMETRY = "nav_msgs/msg/Odometry"
 COVARIANCE = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).ravel()
-OPTICAL = (-0.5, 0.5, -0.5, 0.5)
-"""x ahead, y left, z up → a camera's x right, y down, z ahead."""
+OPTICAL = (-0.5, 0.5, -0.5, 0.5)  # x ahead, y left, z up → a camera's x right, y down, z ahead
 
 
 def samples() -> dict[str, Any]:

@@ -17,8 +17,7 @@ from teamslam.sim.studies.experiments.team_runs import team_run, team_task
 from tests.commands import output_of
 from tests.scenarios import with_world
 
-WORK = "json:loads"
-"""A function that a process imports at once."""
+WORK = "json:loads"  # a function that a process imports at once
 
 
 def counted(rmse: float) -> Task:

@@ -31,8 +31,7 @@ ESCAPES = "\x1b]0;owned\x07\x1b[31mEVIL\x1b[2J<script>alert(1)</script>\u202etxe
 FLOOD = 3000
 LOG_BYTES = 100_000
 """A log of a process stays below this size under a flood; one line per message has 300,000."""
-STOP_S = 4.5
-"""Longer than the patience of a handshake."""
+STOP_S = 4.5  # longer than the patience of a handshake
 Attack = Callable[[ZenohBus], None]
 
 

@@ -19,8 +19,7 @@ from tests.system.scenarios import final_map, short
 
 PAGE = (ROOT / "docs" / "your_robot.md").read_text("utf-8")
 LIVE = PAGE.partition("```toml\n")[2].partition("```")[0]
-PAUSE = "0.05"
-"""Pause [s] of the example at each step: sixty of them take three seconds."""
+PAUSE = "0.05"  # pause [s] of the example at each step: sixty of them take three seconds
 
 
 def recorded(folder: Path) -> bytes:

@@ -11,8 +11,7 @@ from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.system.conftest import Launched
 from tests.system.processes import until
 
-Arrived = list[tuple[str, bytes, bytes]]
-"""(key, payload, attachment) in the order of arrival."""
+Arrived = list[tuple[str, bytes, bytes]]  # (key, payload, attachment) in the order of arrival
 
 
 @contextmanager

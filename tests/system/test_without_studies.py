@@ -10,8 +10,7 @@ from tests.system.processes import Processes
 from tests.system.scenarios import short
 
 PACKAGES = ("team", "central", "sim", "teamslam")
-PATIENCE_S = 300.0
-"""Time limit [s] of a command."""
+PATIENCE_S = 300.0  # time limit [s] of a command
 REMOVABLE = ("sim/studies",)
 REMOVED = """import sys
 

@@ -29,10 +29,8 @@ from teamslam.team.estimation.submap import LocalMap, Unnamed
 
 SITES = ("forest", "parking", "indoor")
 ROBOTS = (0, 1, 2)
-RIGHT = 0.95
-"""Probability that an object's class is right."""
-TAILS = 4.0
-"""Degrees of freedom of the differences of the same objects in two maps."""
+RIGHT = 0.95  # probability that an object's class is right
+TAILS = 4.0  # degrees of freedom of the differences of the same objects in two maps
 STEPS = 100
 
 

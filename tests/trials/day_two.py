@@ -35,8 +35,7 @@ FIRST_DAY_NS = 250 * SECOND_NS
 PER_MAP = 5
 WITHIN_S = 10.0
 RUN_NS = LENGTH_NS + round(WITHIN_S) * SECOND_NS
-NAMED_SIGMAS = {"two": 0.0455, "six": 2e-9}
-"""Probabilities beyond two and six standard deviations."""
+NAMED_SIGMAS = {"two": 0.0455, "six": 2e-9}  # probabilities beyond two and six standard deviations
 
 
 class Start(NamedTuple):

@@ -28,8 +28,7 @@ from teamslam.team.wire.codec import encoded
 
 LANDMARKS, SITE_M = 40, 100.0
 CHANGED, MOVED_M = 0.05, 2.0
-AWAY = (-900.0, -900.0)
-"""Out of every robot's sight."""
+AWAY = (-900.0, -900.0)  # out of every robot's sight
 
 
 class Day(NamedTuple):

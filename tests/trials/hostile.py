@@ -34,10 +34,8 @@ from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests.hostile.drawing import OF_THE_RUN, PAIR, mutated, payloads
 from tests.trials.kills import PROGRAM, await_text, children, expected_of, final_in, shortened
 
-PATIENCE_S = 600.0
-"""Time [s] for a process to begin."""
-SUBMAPS = 1_500
-"""Hostile submaps of a storm: the centre folds each of them that it does not refuse."""
+PATIENCE_S = 600.0  # time [s] for a process to begin
+SUBMAPS = 1_500  # hostile submaps of a storm: the centre folds each of them that it does not refuse
 
 
 def door(count: int, seed: int) -> tuple[int, int, list[str]]:

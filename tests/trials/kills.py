@@ -44,8 +44,7 @@ from teamslam.team.wire.codec import WireError
 
 PROGRAM = (sys.executable, "-P", "-m", "teamslam")
 PROC = Path("/proc")
-STOP_S = 12.0
-"""How long [s] a process is stopped, in the acceptance."""
+STOP_S = 12.0  # how long [s] a process is stopped, in the acceptance
 GAVE_UP = re.compile(r"(\S+) \(pid \d+\) ended with exit status \d+")
 """A process that ended by itself with an error, in the words of `launch`."""
 

@@ -31,8 +31,7 @@ from tests.trials.cuts import PORT, Team
 from tests.trials.kills import PROGRAM, expected_of, final_in, shortened
 
 HOME, AWAY = "10.213.78.1", "10.213.78.2"
-MOST_PACKETS = 2_000
-"""Number of packets under way; further ones are lost, as in a full buffer."""
+MOST_PACKETS = 2_000  # number of packets under way; further ones are lost, as in a full buffer
 CLONE_NEWNET = 0x4000_0000
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x4004_54CA, 0x0001, 0x1000
 FAR = "r1"

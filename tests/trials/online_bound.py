@@ -15,10 +15,8 @@ from teamslam.sim.world import streams as s
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
 
-FAR = float(chi2.isf(1e-9, 3))
-"""NEES of a pose that lies far outside its own covariance."""
-UNKNOWN_M2 = 1e6
-"""The variance of a landmark that nobody has seen."""
+FAR = float(chi2.isf(1e-9, 3))  # NEES of a pose that lies far outside its own covariance
+UNKNOWN_M2 = 1e6  # the variance of a landmark that nobody has seen
 
 
 class Bounded(NamedTuple):

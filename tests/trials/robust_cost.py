@@ -41,8 +41,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 
 PROFILES = ("thesis", "thesis-b", "random-5")
-NO_OUTLIERS = 1e-300
-"""Share of outliers with which a window accepts every measurement."""
+NO_OUTLIERS = 1e-300  # share of outliers with which a window accepts every measurement
 MOST_RATIO = 1.02
 NEES = (0.95, 1.05)
 

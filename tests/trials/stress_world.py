@@ -14,12 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-STEP_S = 0.1
-"""Time between two odometry intervals [s]."""
-SCAN_S = 0.5
-"""Time between two scans [s]."""
-SPEED = 1.0
-"""Nominal speed [m/s]."""
+STEP_S = 0.1  # time between two odometry intervals [s]
+SCAN_S = 0.5  # time between two scans [s]
+SPEED = 1.0  # nominal speed [m/s]
 
 
 @dataclass(frozen=True)

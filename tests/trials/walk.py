@@ -25,8 +25,7 @@ from teamslam.team.robot.node import RobotNode, robot_node
 from teamslam.team.wire import messages as m
 from tests.support import ROOT
 
-PRODUCT = ("team", "central", "sim")
-"""The folders of the product."""
+PRODUCT = ("team", "central", "sim")  # the folders of the product
 Node = TypeVar("Node", RobotNode, CentralNode)
 
 

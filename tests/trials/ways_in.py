@@ -52,8 +52,7 @@ EXACT = ("zip", "csv")
 BY_POINTS = ("mcap", "db3", "rmw", "bridge", "log")
 STORE = ros.STORE
 ODOMETRY, TAGS = "nav_msgs/msg/Odometry", "vision_msgs/msg/Detection3DArray"
-START_SIGMAS = (0.05, 0.03)
-"""As the UTIAS reader has them [m, rad]."""
+START_SIGMAS = (0.05, 0.03)  # as the UTIAS reader has them [m, rad]
 QUIET_S = 10.0
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 

@@ -26,8 +26,7 @@ from teamslam.team.wire.arrays import floats
 
 APART_NS = 2_000_000_000  # greatest time between two compared measurements of a landmark
 STRETCH_NS = 5_000_000_000
-LEAST_STRETCHES = 12
-"""Least effective number of stretches, 1/Σ share² of the information on τ."""
+LEAST_STRETCHES = 12  # least effective number of stretches, 1/Σ share² of the information on τ
 STEP_NS = 250_000_000  # step of the central derivative by τ; averages interval noise
 HUBER = 2.0
 ROUNDS = 20
@@ -36,8 +35,7 @@ LEAST_SLOPE = 0.2  # least share of the derivative that is motion, not odometry 
 LARGEST_NS = 2_000_000_000  # largest plausible clock offset
 NEAR_M = 1.0  # point errors grow with distance beyond this [m]
 BEYOND_DOUBT = 5.0  # offset, in standard deviations, from which it is reported
-CONTRADICTION = 4.0
-"""Standard deviations from which two estimates of an offset exclude each other."""
+CONTRADICTION = 4.0  # standard deviations from which two estimates of an offset exclude each other
 LEAST_S = 0.02  # smallest reported offset [s]
 UNIX_S = 1e9
 

@@ -34,8 +34,7 @@ class Event:
         return self.node.removeprefix("robot/")
 
 
-Found = Iterator[tuple[Kind, str, str]]
-"""Kind, node and text of each event."""
+Found = Iterator[tuple[Kind, str, str]]  # kind, node and text of each event
 
 
 @dataclass

@@ -109,8 +109,7 @@ class _Clocks:
         return self._clocks[k] if known else None
 
 
-_Rows = list[tuple[int, float]]
-"""Stamps [ns] and values."""
+_Rows = list[tuple[int, float]]  # stamps [ns] and values
 
 
 class _Gathering:

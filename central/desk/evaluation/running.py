@@ -25,8 +25,7 @@ from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 
-KNOWN_FRAMES = {"", START_POSES, SURVEY_FRAME}
-"""Frames with truth that no stream's start fixes."""
+KNOWN_FRAMES = {"", START_POSES, SURVEY_FRAME}  # frames with truth that no stream's start fixes
 SPACING_NS = 100_000_000  # least spacing of compared estimates
 WAITING = 4_096  # most poses per robot that await truth
 BATCHES = 20_000  # most truth batches kept per robot

@@ -35,8 +35,7 @@ MAP_COLUMNS = (
 DEGREES = ("latitude_deg", "longitude_deg")  # further columns of a map with a datum
 STATE = "state"
 """Further column of a map that was compared with saved ones: moved, gone, new, unchanged."""
-CLASSES = ("class", "class_probability")
-"""Further columns of a map whose landmarks have classes."""
+CLASSES = ("class", "class_probability")  # further columns of a map whose landmarks have classes
 PATH_COLUMNS = (
     "t_s", "x_m", "y_m", "theta_rad", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "cov_xt_m_rad",
     "cov_yt_m_rad", "cov_tt_rad2",

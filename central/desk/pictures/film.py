@@ -21,8 +21,7 @@ from teamslam.team.wire import messages as m
 if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes
 
-FRAMES, LAST_FRAMES, PER_S = 136, 24, 8
-"""Frames of the run, of its result, and per second: 20 s."""
+FRAMES, LAST_FRAMES, PER_S = 136, 24, 8  # frames of the run, of its result, and per second: 20 s
 SIZE_IN, DPI = 5.0, 96
 
 

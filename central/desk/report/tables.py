@@ -28,10 +28,8 @@ ARBITRARY = "–: no initial pose is known, the frame is arbitrary"
 DEGREES = degrees(1.0)
 LEFT = ("robot", "disposition", "channel", "kind", "landmarks", "reason")
 """Headings of text columns."""
-CHANGES = ("moved", "gone", "new", "unchanged")
-"""States of landmarks against saved maps, as listed."""
-LISTED = 5
-"""Most landmarks of one state in a line of text, and most robots named below a table."""
+CHANGES = ("moved", "gone", "new", "unchanged")  # states of landmarks against saved maps, as listed
+LISTED = 5  # most landmarks of one state in a line of text, and most robots named below a table
 DECISIONS = 200  # most decisions in the table; report.json has all
 Rows = Sequence[tuple[str, str]]
 

@@ -22,8 +22,7 @@ from teamslam.team.wire.codec import WireError
 
 M = TypeVar("M", bound=m.Message)
 T = TypeVar("T")
-Identity = tuple[object, ...]
-"""Message key and names of its inputs."""
+Identity = tuple[object, ...]  # message key and names of its inputs
 
 
 class RerunError(ValueError):

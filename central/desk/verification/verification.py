@@ -223,8 +223,7 @@ def _compute_parts(parts: Sequence[Part], processes: int) -> Iterator[Mapping[Id
         pool.shutdown(cancel_futures=True)
 
 
-_inherited: list[Part] = []
-"""Parts of a forked process."""
+_inherited: list[Part] = []  # parts of a forked process
 
 
 def _compute_part(number: int) -> Mapping[Identity, m.Message]:

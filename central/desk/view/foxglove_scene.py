@@ -21,10 +21,8 @@ from teamslam.central.desk.view.drawn import Landmarks
 from teamslam.team.shapes import Float
 from teamslam.team.wire.views import MAP_FRAME
 
-Fields = dict[str, Any]
-"""Fields of a Foxglove message by name; parts are fields, too."""
-Shade = tuple[str, float]
-"""Colour #rrggbb and opacity."""
+Fields = dict[str, Any]  # fields of a Foxglove message by name; parts are fields, too
+Shade = tuple[str, float]  # colour #rrggbb and opacity
 TRUTH: Shade = ("#8a93a3", 0.9)
 LANDMARK: Shade = ("#f5b83d", 1.0)
 _FLAT_M = 0.002

@@ -18,8 +18,7 @@ class FoxgloveServer(ServerListener):
     """SDK server at a hidden loopback address."""
 
     def __init__(self) -> None:
-        self.team = ""
-        """Team name; set before the first view."""
+        self.team = ""  # team name; set before the first view
         self._context = Context()
         self._channels: dict[str, Channel] = {}
         self._newest: dict[str, Sample] = {}

@@ -21,10 +21,8 @@ from teamslam.team.estimation.models import NEAREST_M, predicted
 from teamslam.team.estimation.se2 import Point, wrapped
 from teamslam.team.shapes import Float
 
-BIASES = ("bearing", "range_offset", "range_scale")
-"""Sensor biases, in state order."""
-FORGOTTEN = 1e-3
-"""Correlation below which the error process begins anew."""
+BIASES = ("bearing", "range_offset", "range_scale")  # sensor biases, in state order
+FORGOTTEN = 1e-3  # correlation below which the error process begins anew
 _ERRORS = 2**56
 _BIASES = 2**57
 _BASES = 2**58

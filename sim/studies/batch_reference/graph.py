@@ -20,8 +20,7 @@ _CHAIN = 2**32
 FLOOR_SIGMAS = (1e-4, 2e-3, 1e-4)
 """Added to each motion (forward [m], left [m], turn [rad]), since its covariance may be singular.
 """
-EXACT_SIGMA = 1e-5
-"""Standard deviation of an exactly known initial pose [m, rad]."""
+EXACT_SIGMA = 1e-5  # standard deviation of an exactly known initial pose [m, rad]
 
 
 def load_gtsam() -> Any:

@@ -32,8 +32,7 @@ from teamslam.team.shapes import Float, UInt32
 
 ROBUST_START, ROBUST_DECAY = 8.0, 0.7
 """A robust solution begins with Cauchy's scale 8 c, which narrows to c."""
-_POSES = 2**32
-"""First key of a pose; a landmark's is its id < 2³²."""
+_POSES = 2**32  # first key of a pose; a landmark's is its id < 2³²
 
 
 class UnsolvableError(ValueError):

@@ -51,8 +51,7 @@ from teamslam.team.registry import NotInstalledError
 from teamslam.team.shapes import Float, UInt32
 from teamslam.team.wire.bus import Sample
 
-LARGEST_DECREMENT = 1e-3
-"""Allowed √(gᵀH⁻¹g) at the optimum; reweighting converges linearly."""
+LARGEST_DECREMENT = 1e-3  # allowed √(gᵀH⁻¹g) at the optimum; reweighting converges linearly
 ITERATIONS = 1000
 NoiseKind = Literal["white", "profile"]
 NO_BIASES = (None, None, None)

@@ -186,10 +186,8 @@ def _move(
     return turned + a_from_b[:2], G
 
 
-ITERATIONS = 10
-"""Most Gauss-Newton steps of two maps' joint solution."""
-STANDS_STILL = 1e-9
-"""Largest change of a coordinate [m, rad] in the last step."""
+ITERATIONS = 10  # most Gauss-Newton steps of two maps' joint solution
+STANDS_STILL = 1e-9  # largest change of a coordinate [m, rad] in the last step
 
 
 def exchange_maps_fully(a: LandmarkGaussian, b: LandmarkGaussian) -> _ExchangedMap:

@@ -23,8 +23,7 @@ from teamslam.team.estimation.consistency import chi2_interval
 
 WORLDS = ("thesis", "thesis-b")
 COUNTS = (3, 4, 5)
-SEEN_EVERY_S = 5.0
-"""Spacing [s] of the pose nodes for inter-robot measurements."""
+SEEN_EVERY_S = 5.0  # spacing [s] of the pose nodes for inter-robot measurements
 WIDE = ("is placed weakly", "farther off than its covariance")
 """Parts of warnings about covariances, not minima."""
 SHOWN: Shown = (

@@ -26,8 +26,7 @@ from teamslam.sim.world.config import OutlierKind
 
 WORLDS = ("thesis", "thesis-b")
 SHARE = 0.3
-LANDMARK_SUBMAPS = 2
-"""Least number of submaps of a landmark."""
+LANDMARK_SUBMAPS = 2  # least number of submaps of a landmark
 KINDS: tuple[OutlierKind, ...] = ("drop", "measurement", "identity")
 NAMES = {"drop": "clean", "measurement": "random measurements", "identity": "random identities"}
 MOST_SEEDS = 30

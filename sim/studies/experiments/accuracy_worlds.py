@@ -38,8 +38,7 @@ class World(NamedTuple):
     batch: bool = True
 
 
-OTHERS_SEEDS = 10
-"""Most seeds of pairs for comparison."""
+OTHERS_SEEDS = 10  # most seeds of pairs for comparison
 _THESIS = {
     "nees": (0.93, 1.07),
     "in_band": (0.90, 1.0),

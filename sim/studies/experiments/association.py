@@ -27,8 +27,7 @@ if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.figure import Figure
 
 SIZE_M, LANDMARKS, VIEW_M, STEPS = 60.0, 40, 12.0, 150
-SPACING_M = 0.5 * SIZE_M / LANDMARKS**0.5
-"""Mean distance of a landmark from its nearest neighbour."""
+SPACING_M = 0.5 * SIZE_M / LANDMARKS**0.5  # mean distance of a landmark from its nearest neighbour
 RATIOS = (4.0, 6.0, 10.0, 20.0, 40.0)
 CLUTTER = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 MISSED = (0.0, 0.1, 0.2, 0.3, 0.5)

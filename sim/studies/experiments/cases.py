@@ -20,8 +20,7 @@ from teamslam.sim.studies.experiments.task import Task
 
 FOLDER = "cases"
 _STORED = "output.pkl"
-IDLE_S = 5
-"""Timeout [s] of an idle worker."""
+IDLE_S = 5  # timeout [s] of an idle worker
 Cached = Callable[..., dict[str, Any]]
 
 
@@ -135,8 +134,7 @@ def _result(
     return Task(work, parameters, "", local=local).run()
 
 
-DESCRIPTION = "shard.json"
-"""File in a shard's folder: study, number, and digests of its program."""
+DESCRIPTION = "shard.json"  # file in a shard's folder: study, number, and digests of its program
 
 
 class ShardError(ValueError):

@@ -24,11 +24,9 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Sample, opened
 
-STEP_S = 1.0
-"""Length [s] of a step of the thesis' world."""
+STEP_S = 1.0  # length [s] of a step of the thesis' world
 Map = m.FusedMap | m.MapEstimate
-DIGITS = 5
-"""Significant digits of a stored curve."""
+DIGITS = 5  # significant digits of a stored curve
 
 
 def curves_task(

@@ -88,14 +88,11 @@ TEAM_MAPS: Mapping[str, float] = {
     "6": 0.0103, "7": 0.0335, "8": 0.0423, "9": 0.0877,
 }  # fmt: skip
 """Table 5.5: joined maps of five robots."""
-P_EKF_JOINED = 3.04e-4
-"""Chapter 5: paired t-test of tables 5.1 and 5.3."""
-P_JOINED_TEAM = 0.1018
-"""Chapter 5: paired t-test of tables 5.3 and 5.5."""
+P_EKF_JOINED = 3.04e-4  # chapter 5: paired t-test of tables 5.1 and 5.3
+P_JOINED_TEAM = 0.1018  # chapter 5: paired t-test of tables 5.3 and 5.5
 
 
-Row = tuple[float | None, ...]
-"""Errors [m] of robots 1 … 5, or of the team."""
+Row = tuple[float | None, ...]  # errors [m] of robots 1 … 5, or of the team
 QUICK_S = 300.0
 TEAM = "team"
 

@@ -36,14 +36,11 @@ from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Sample
 
 FRAME_S = 0.2
-FRAMES = 1400
-"""Frames of the report, roughly five minutes."""
+FRAMES = 1400  # frames of the report, roughly five minutes
 MOTION = MotionModel(alphas=(0.1,) * 6, alpha_interval_s=0.02)
 SENSOR = Sensor(range_sigma=0.0167**0.5, bearing_sigma=0.000736589**0.5)
-START_SIGMA = 1e-3
-"""Standard deviation of the program's initial covariance [m, rad]."""
-PARTICLES = 100
-"""The program's default; not in the report."""
+START_SIGMA = 1e-3  # standard deviation of the program's initial covariance [m, rad]
+PARTICLES = 100  # the program's default; not in the report
 DEAD_RECKONING = Method("dead reckoning", "dead-reckoning", "alone", 1, VERMILION, PARTICLES)
 SINGLE = Method("single FastSLAM", "fastslam1", "alone", 1, BLUE, PARTICLES)
 MULTI_3 = Method("multi, 3 robots", "dead-reckoning", "joint-fastslam", 3, ORANGE, PARTICLES)

@@ -81,8 +81,7 @@ def _flat(value: Any, path: str) -> Iterator[tuple[str, str]]:
         yield path, f"{value:.6g}" if isinstance(value, float) else json.dumps(value)
 
 
-FAILURES = "failures.txt"
-"""File with the tracebacks of the last command's failed runs."""
+FAILURES = "failures.txt"  # file with the tracebacks of the last command's failed runs
 
 
 @dataclass(frozen=True)

@@ -70,8 +70,7 @@ def _path(module: str) -> Path | None:
 
 
 ROOTS = ("teamslam",)
-LIBRARIES = ("numpy", "scipy", "gtsam")
-"""Libraries that results depend on."""
+LIBRARIES = ("numpy", "scipy", "gtsam")  # libraries that results depend on
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,9 @@ Figures = dict[str, Any]
 Shown = Sequence[tuple[str, str, str]]
 """Columns of a table: the figure's name, the heading, the format."""
 OURS: tuple[Estimator, FusionRule] = ("hybrid", "join")
-_HYBRID_STEP_S, _STEP_S = 2e-3, 5e-4
-"""Estimated time [s] of a robot's step."""
+_HYBRID_STEP_S, _STEP_S = 2e-3, 5e-4  # estimated time [s] of a robot's step
 _STEPS_TO_A_WAY_POINT = 22
-_DOUBLING_LANDMARKS = 100
-"""Number of landmarks that doubles the time of a step."""
+_DOUBLING_LANDMARKS = 100  # number of landmarks that doubles the time of a step
 _UTIAS_S, _UTIAS_BATCH_S = 40.0, 160.0
 
 

@@ -33,16 +33,11 @@ Rows = Float[np.ndarray, "_ _"]
 Blocks = Float[np.ndarray, "K r m"]
 Indices = Int64[np.ndarray, " _"]
 
-AT_REST = 1e-9
-"""Expected decrease of χ² by an undamped step of a converged state."""
-SMALL = 1e-5
-"""Expected decrease of χ² by a damped step before a test of convergence."""
-STEPS = 2000
-"""Most steps of a solution."""
-UNDAMPED = 1e-12
-"""Least damping: undetermined coordinates keep their values."""
-DAMPING = 1e-3
-"""First damping, relative to the diagonal of the normal equations."""
+AT_REST = 1e-9  # expected decrease of χ² by an undamped step of a converged state
+SMALL = 1e-5  # expected decrease of χ² by a damped step before a test of convergence
+STEPS = 2000  # most steps of a solution
+UNDAMPED = 1e-12  # least damping: undetermined coordinates keep their values
+DAMPING = 1e-3  # first damping, relative to the diagonal of the normal equations
 
 
 class _Solution(NamedTuple):
@@ -254,14 +249,10 @@ def _around(angles: Float[np.ndarray, "*_"]) -> Float[np.ndarray, "*_"]:
     return np.asarray(np.angle(np.exp(1j * angles)))
 
 
-LOWER = 1.0
-"""Decrease of the cost that indicates another minimum."""
-LIKELY = 0.999
-"""Quantile of χ² beyond which a place, or the truth, is excluded."""
-NEARBY = 3
-"""Number of initial states near the truth, besides the truth."""
-NEARBY_RAD = 0.1
-"""Standard deviation [rad] of these states' headings about the truth."""
+LOWER = 1.0  # decrease of the cost that indicates another minimum
+LIKELY = 0.999  # quantile of χ² beyond which a place, or the truth, is excluded
+NEARBY = 3  # number of initial states near the truth, besides the truth
+NEARBY_RAD = 0.1  # standard deviation [rad] of these states' headings about the truth
 
 
 class TrueMinimum(NamedTuple):

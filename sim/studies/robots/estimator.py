@@ -111,8 +111,7 @@ def estimator_of(
 
 
 IN_MAP = "in the running map"
-IN_POSE = "in the running pose"
-"""Dispositions of a measurement that such an estimator uses."""
+IN_POSE = "in the running pose"  # dispositions of a measurement that such an estimator uses
 InitialState = Callable[[RobotConfig, InitialPose, KnownMap, np.random.Generator], Any]
 FilterStep = Callable[[Any, RobotStep, np.random.Generator], Any]
 

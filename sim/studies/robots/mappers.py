@@ -31,8 +31,7 @@ from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing
 
-JOINT_LANDMARKS = 2000
-"""Landmarks beyond which a map has only 2 × 2 covariances."""
+JOINT_LANDMARKS = 2000  # landmarks beyond which a map has only 2 × 2 covariances
 
 
 class MapExchange:

@@ -23,8 +23,7 @@ from teamslam.team.wire.bus import Outgoing
 
 RUNNING_ITERATIONS, RUNNING_DECREMENT = 5, 1e-2
 """Most iterations of a broadcast's map, and the Newton step in σ that ends them."""
-FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5
-"""The same for the final map."""
+FINAL_ITERATIONS, FINAL_DECREMENT = 200, 1e-5  # the same for the final map
 
 
 class BatchCentre(MeasurementCentre):

@@ -16,8 +16,7 @@ from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.wire.bus import Outgoing
 
-RESAMPLE_BELOW = 1.0
-"""Resamples at every step, as algorithm 1 does."""
+RESAMPLE_BELOW = 1.0  # resamples at every step, as algorithm 1 does
 
 
 class JointFastSlamCentre(MeasurementCentre):

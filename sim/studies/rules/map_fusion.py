@@ -21,12 +21,10 @@ from teamslam.team.estimation.gaussian import (
 from teamslam.team.shapes import Float, Int64
 
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-SEARCH_STEPS = 60
-"""Golden sections of [0, 1]: the last interval is 3·10⁻¹³ wide."""
+SEARCH_STEPS = 60  # golden sections of [0, 1]: the last interval is 3·10⁻¹³ wide
 
 
-SMALLEST_VARIANCE = 1e-12
-"""Least variance [m²]: absorbing halves the variance in every round."""
+SMALLEST_VARIANCE = 1e-12  # least variance [m²]: absorbing halves the variance in every round
 
 
 def kalman(maps: Sequence[LandmarkGaussian]) -> LandmarkGaussian:

@@ -31,8 +31,7 @@ ROOT = Path(__file__).resolve().parents[3]
 SOURCES = ROOT / "team" / "core"
 MODULES = "_core_*"
 ZIG = "ziglang>=0.13"
-CMAKE = (3, 20)
-"""Least version, that of CMakeLists.txt."""
+CMAKE = (3, 20)  # least version, that of CMakeLists.txt
 COMPILERS = ("c++", "g++", "clang++")
 C20 = "#include <bit>\n#include <concepts>\n#include <span>\nstd::span<const double> numbers;\n"
 NO_COMPILER = """\

@@ -44,8 +44,7 @@ LEAST_SUBMAPS = 2
 """Fewest submaps that place a landmark elsewhere for it to have moved, if it has no number or its
 former place is empty.
 """
-REMEDY = "load the right map, or save a new one"
-"""For a saved map that does not join."""
+REMEDY = "load the right map, or save a new one"  # for a saved map that does not join
 LEAST_AGREEING = 3  # fewest landmarks that must agree where others disagree
 MOST_PAIRS = 2000  # most pairs of shared landmarks from which a frame is proposed
 

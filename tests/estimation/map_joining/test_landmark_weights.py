@@ -25,8 +25,7 @@ from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import seen_from, solved, team
 
 ROBUST = JoinSettings()
-WHOLE = replace(ROBUST, landmark_gate=math.inf)
-"""The mutant: one weight for a whole submap."""
+WHOLE = replace(ROBUST, landmark_gate=math.inf)  # the mutant: one weight for a whole submap
 
 
 def mistaken(world, seed, share=0.3):

@@ -19,8 +19,7 @@ from tests.estimation.submap_world import local_truth
 
 OWN, COMMON, MARKER = 0.03, 0.1, 0.04
 SIGMA = {"range_scale": OWN}
-SHARE = 0.1
-"""Standard deviation of a range's error in one submap, as a share of the range."""
+SHARE = 0.1  # standard deviation of a range's error in one submap, as a share of the range
 LANDMARKS = np.array([[4.0, 3.0], [6.0, -3.0], [9.0, 2.0], [3.0, -4.0], [11.0, -2.0]])
 
 

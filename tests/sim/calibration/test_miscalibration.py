@@ -15,8 +15,7 @@ from teamslam.team.config import Bias, FrontEnd, MotionModel, MotionNoise, Robot
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from tests.scenarios import final_only
 
-SPEED = 0.25
-"""[m/s]; the models below were calibrated at up to 0.09."""
+SPEED = 0.25  # [m/s]; the models below were calibrated at up to 0.09
 
 
 def fast_team(biases: tuple[Bias, ...]) -> Scenario:

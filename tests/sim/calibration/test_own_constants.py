@@ -13,8 +13,7 @@ PLACES = {i: (1.0 + 0.4 * i) * np.array([np.cos(a), np.sin(a)])
           for i, a in enumerate(np.linspace(-0.6, 0.6, 8), 1)}  # fmt: skip
 CAMERAS = {"r1": (1.02, 0.05, 0.0), "r2": (1.05, 0.0, 0.01), "r3": (0.99, 0.1, -0.04)}
 """range_scale, range_offset [m], optical_axis [rad]."""
-BENT = -0.05
-"""Cubic error of the bearings."""
+BENT = -0.05  # cubic error of the bearings
 
 
 def looking(

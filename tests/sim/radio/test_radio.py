@@ -12,8 +12,7 @@ from tests.support import submap
 from tests.teams import stream
 
 SECOND = 1_000_000_000
-PAIR = (stream("r1", 20), stream("r2", 20, y=30.0))
-"""They drive side by side, 30 m apart."""
+PAIR = (stream("r1", 20), stream("r2", 20, y=30.0))  # they drive side by side, 30 m apart
 
 
 def test_robots_reach_each_other_within_the_range_by_the_truth():

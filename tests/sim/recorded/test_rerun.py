@@ -25,8 +25,7 @@ from tests.sim.reruns import changed, messages, said, team_samples, thesis, writ
 from tests.teams import LOCALISERS, Team, config, stream, world_of
 
 STEPS = 60
-ODOMETRY_OF_SUBMAP_3 = 35
-"""The 35th interval of r2 lies in its fourth window of 10 s."""
+ODOMETRY_OF_SUBMAP_3 = 35  # the 35th interval of r2 lies in its fourth window of 10 s
 
 
 @pytest.fixture(scope="module")
