@@ -57,7 +57,7 @@ SIGN_REMEDY = (
 )
 START_REMEDY = "correct its initial pose by that, or remove it: a robot is joined without one"
 OTHER_START = "; two initial poses contradict each other, so {other}'s may be the wrong one"
-"""Of a team with two known initial poses: a majority would tell."""
+"""For a team with two known initial poses, where no majority decides."""
 
 
 class _SharedError(NamedTuple):
