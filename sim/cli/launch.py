@@ -327,7 +327,7 @@ def _keep_earlier(log: Path) -> None:
     if log.exists() and not log.is_file():
         refuse(f"--record {log}: not a regular file; give the path of a new log")
     if log.exists():
-        from teamslam.team.recording.part_files import part_of, parts_of
+        from teamslam.team.recording.reader import part_of, parts_of
 
         parts = parts_of(log)
         aside = opt.set_aside(log)

@@ -17,8 +17,8 @@ from teamslam.team.wire.text import one_line
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from teamslam.team.recording.editing import KeySummary
     from teamslam.team.recording.reader import Log
-    from teamslam.team.recording.summary import KeySummary
     from teamslam.team.wire.channels import Channel
 
 NewLog = Annotated[Path, output_option("The new log.", "FILE")]
@@ -47,8 +47,8 @@ def info(
     from rich.text import Text
 
     from teamslam.team.recording.check import holes
+    from teamslam.team.recording.editing import summarise_log
     from teamslam.team.recording.reader import open_log
-    from teamslam.team.recording.summary import summarise_log
 
     opened = open_log(log)
     lacks = holes(opened)
@@ -118,7 +118,7 @@ def cut(
     """
     import math
 
-    from teamslam.team.recording.cut import cut as cut_log
+    from teamslam.team.recording.editing import cut as cut_log
     from teamslam.team.recording.reader import open_log
 
     bounds = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
@@ -138,7 +138,7 @@ def merge(
     output: NewLog,
 ) -> None:
     """Merge logs by team time; messages that several logs have are written once."""
-    from teamslam.team.recording.merge import merge as merge_logs
+    from teamslam.team.recording.editing import merge as merge_logs
     from teamslam.team.recording.reader import open_log
 
     opt.refuse_existing(output)

@@ -334,10 +334,9 @@ def record(
     completes an interrupted join.
     """
     from teamslam.sim.scenarios.scenario import dumps
-    from teamslam.team.recording.part_files import parts_of
     from teamslam.team.recording.parts import check_continues, next_part
     from teamslam.team.recording.provenance import provenance
-    from teamslam.team.recording.reader import LogError
+    from teamslam.team.recording.reader import LogError, parts_of
     from teamslam.team.recording.shell import RecordLoop
     from teamslam.team.shell import process
     from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL, robot_node

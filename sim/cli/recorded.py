@@ -183,8 +183,8 @@ def repair(
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from teamslam.sim.importing.source import is_own_log
+    from teamslam.team.recording.editing import repair_bag, repair_log
     from teamslam.team.recording.reader import log_file
-    from teamslam.team.recording.repair import repair_bag, repair_log
 
     opt.refuse_existing(output)
     log = log_file(log)

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from teamslam.team.recording.counters import LATEST_NS, Counters
-from teamslam.team.recording.cut import CUT
+from teamslam.team.recording.editing import CUT, REPAIRED, read_undamaged
 from teamslam.team.recording.inventory import MISSING, Inventory
 from teamslam.team.recording.reader import Log
+from teamslam.team.recording.recorder import Declaration, schema_of
 from teamslam.team.recording.records import check_index
-from teamslam.team.recording.repair import REPAIRED, read_undamaged
-from teamslam.team.recording.schemas import Declaration, schema_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open

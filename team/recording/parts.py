@@ -13,19 +13,22 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from teamslam.team.recording.editing import read_undamaged
 from teamslam.team.recording.inventory import Inventory
-from teamslam.team.recording.part_files import (
+from teamslam.team.recording.provenance import provenance
+from teamslam.team.recording.reader import (
     JOINED,
     LOG_ID,
+    Log,
+    LogError,
     LogFile,
     Parts,
+    log_of,
+    open_log,
     part_of,
     read_parts,
 )
-from teamslam.team.recording.provenance import provenance
-from teamslam.team.recording.reader import Log, LogError, log_of, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
-from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.wall_clock import wall_clock, was_set_since
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import FINAL_MAP, Channel

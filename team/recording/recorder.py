@@ -5,21 +5,62 @@ Log time: team time, at least 0. Publish time: publisher's wall clock. Sequence:
 The metadata record "teamslam" describes run and program.
 """
 
+import json
 import threading
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import IO, Self
+from typing import IO, NamedTuple, Self
 
+import msgspec
 from mcap.writer import Writer
 
-from teamslam.team.recording.schemas import declaration_of
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import channel_of
 from teamslam.team.wire.codec import tag_in
-from teamslam.team.wire.messages import tag_of
+from teamslam.team.wire.messages import Message, tag_of
+from teamslam.team.wire.views import json_schema, view_of
+
+
+def schema_of(message: type[Message]) -> bytes:
+    """Return the JSON Schema of a message as UTF-8 bytes, deterministic."""
+    return json.dumps(msgspec.json.schema(message), sort_keys=True).encode()
+
+
+class Declaration(NamedTuple):
+    """A key's payload encoding, schema name and text."""
+
+    encoding: str
+    schema: str
+    schema_encoding: str
+    text: bytes
+
+
+def declaration_of(key: str, tag: str = "") -> Declaration | None:
+    """Return the declaration of a relative key, for a message's tag if it has several; None: no
+    row.
+    """
+    found = channel_of(key)
+    if found is not None:
+        kind = found[0].kind_of(tag)
+        return Declaration("msgpack", tag_of(kind), "jsonschema", schema_of(kind))
+    view = view_of(key)
+    if view is None:
+        return None
+    if isinstance(view.schema, str):
+        from mcap_protobuf.schema import build_file_descriptor_set  # needed for views only
+
+        name = view.schema.removeprefix("foxglove.")
+        kind_there = getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+        files = build_file_descriptor_set(kind_there).SerializeToString()
+        return Declaration("protobuf", view.schema, "protobuf", files)
+    name = f"teamslam.{view.schema.__name__}"
+    text = json.dumps(json_schema(view.schema), sort_keys=True).encode()
+    return Declaration("json", name, "jsonschema", text)
+
 
 METADATA = "teamslam"
 CHUNK_NS = 500_000_000  # largest span of wall time in a chunk, since a flipped bit costs a chunk …

@@ -10,7 +10,7 @@ import msgspec
 
 from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream
-from teamslam.team.recording.part_files import LOG_ID
+from teamslam.team.recording.reader import LOG_ID
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m

@@ -12,10 +12,10 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from teamslam.team import core
+from teamslam.team.recording.editing import repair_log
 from teamslam.team.recording.provenance import estimation_digest, provenance
 from teamslam.team.recording.reader import LARGEST_CHUNK, DamagedChunkError, Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder, RecorderError
-from teamslam.team.recording.repair import repair_log
 from teamslam.team.wire import channels as c
 from teamslam.team.wire.bus import Sample, opened
 from tests import build

@@ -11,14 +11,12 @@ from mcap.opcode import Opcode
 
 from teamslam.sim.scenarios.scenario import dumps, load
 from teamslam.team.recording.check import check_log, holes
+from teamslam.team.recording.editing import merge, read_undamaged
 from teamslam.team.recording.inventory import Inventory
-from teamslam.team.recording.merge import merge
-from teamslam.team.recording.part_files import part_of, parts_of
 from teamslam.team.recording.parts import check_continues, join_parts, next_part, own_log
-from teamslam.team.recording.reader import LogError, open_log
+from teamslam.team.recording.reader import LogError, open_log, part_of, parts_of
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.records import read_frames
-from teamslam.team.recording.repair import read_undamaged
 from teamslam.team.recording.shell import RecordLoop
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m

@@ -13,12 +13,9 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from teamslam.team.recording.check import DRAWN, check_log, find_misdeclaration
 from teamslam.team.recording.counters import Counters
-from teamslam.team.recording.cut import cut
-from teamslam.team.recording.merge import MERGED, merge
+from teamslam.team.recording.editing import MERGED, cut, merge, summarise_log
 from teamslam.team.recording.reader import Log, LogError, open_log
-from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.schemas import schema_of
-from teamslam.team.recording.summary import summarise_log
+from teamslam.team.recording.recorder import Recorder, schema_of
 from teamslam.team.recording.tables import export_tables, table_of
 from teamslam.team.wire import channels as c
 from teamslam.team.wire import messages as m

@@ -10,7 +10,7 @@ import foxglove
 from foxglove import Channel, Context, Schema
 from foxglove.websocket import Capability, ChannelView, Client, ServerListener
 
-from teamslam.team.recording.schemas import declaration_of
+from teamslam.team.recording.recorder import declaration_of
 from teamslam.team.wire.bus import Sample
 
 

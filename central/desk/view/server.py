@@ -28,8 +28,7 @@ from websockets.typing import Subprotocol
 
 from teamslam.central.desk.view.export import VIEWED, Viewing
 from teamslam.central.desk.view.page_frames import CHANNELS, PageFrames
-from teamslam.team.recording.reader import LogError
-from teamslam.team.recording.tail import Tail
+from teamslam.team.recording.reader import LogError, Tail
 from teamslam.team.wire.bus import BusError
 
 if TYPE_CHECKING:

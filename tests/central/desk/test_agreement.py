@@ -11,8 +11,8 @@ from teamslam.central.desk.peers_as_centre import Agreement, PeersAsCentre
 from teamslam.central.desk.view.server import Feed
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.config import RobotConfig
+from teamslam.team.recording.reader import Tail
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.tail import Tail
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample

@@ -34,9 +34,8 @@ from teamslam.central.desk.view.server import (
     session,
 )
 from teamslam.sim.cli import view
-from teamslam.team.recording.reader import LogError
+from teamslam.team.recording.reader import LogError, Tail
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.recording.tail import Tail
 from teamslam.team.translate import joint_bytes, landmark_covariance_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
