@@ -19,8 +19,7 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.baseline import find_worse
 from teamslam.sim.importing.bag import import_bag
-from teamslam.team.ros2.decoding import READERS, DamagedError, decode
-from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.decoding import READERS, DamagedError, decode, types
 from tests.ros2 import messages as ros
 from tests.ros2.test_decoding import SAMPLES
 

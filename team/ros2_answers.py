@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from teamslam.team.config import UNNAMED
 from teamslam.team.ros2 import encoding as ros
 from teamslam.team.ros2.arrivals import attachment
-from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.decoding import types
 from teamslam.team.ros2.encoding import Names, Pose, compose, inverse, names_of
 from teamslam.team.ros2.keys import publication
 from teamslam.team.ros2.topics import RobotTopics

@@ -24,9 +24,8 @@ from teamslam.team.ros2.decoding import (
     TransformsRecord,
     decode,
 )
-from teamslam.team.ros2.frames import Frames, describe_misplacement, planar
+from teamslam.team.ros2.frames import Frames, Owners, describe_misplacement, planar
 from teamslam.team.ros2.keys import BRIDGE_TOKENS, expressions, of_rmw, of_token, static_topics
-from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics
 from teamslam.team.ros2.translator import (
     NO_DATUM,

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import msgspec
 
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.columns import FUSED_WORDS, TRUTH_WORDS, has_word
-from teamslam.sim.importing.tables import Report, RobotTables
+from teamslam.sim.importing.tables import FUSED_WORDS, TRUTH_WORDS, Report, RobotTables, has_word
 from teamslam.team.datum import Datum
 from teamslam.team.ros2.bags import Bag, Topic, opened_bag
 from teamslam.team.ros2.decoding import (
@@ -21,9 +20,8 @@ from teamslam.team.ros2.decoding import (
     TransformsRecord,
     decode,
 )
-from teamslam.team.ros2.frames import Frames
+from teamslam.team.ros2.frames import Frames, Owners
 from teamslam.team.ros2.keys import STATIC, moving_topics, static_topics
-from teamslam.team.ros2.owners import Owners
 from teamslam.team.ros2.topics import RobotTopics, Topics
 from teamslam.team.ros2.translator import TAG, Translator
 

@@ -17,22 +17,22 @@ from teamslam.sim.datasets.folder_tables import (
     POSES,
 )
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.columns import (
-    MEASURED,
-    REQUIRED,
-    TABLES,
-    Map,
-    Table,
-    map_columns,
-    names_robot,
-)
 from teamslam.sim.importing.proposal import (
     MOST_ROBOTS,
     drop_line,
     propose_map,
     proposed_kinds,
 )
-from teamslam.sim.importing.tables import RobotTables
+from teamslam.sim.importing.tables import (
+    MEASURED,
+    REQUIRED,
+    TABLES,
+    Map,
+    RobotTables,
+    Table,
+    map_columns,
+    names_robot,
+)
 from teamslam.sim.world.streams import polar_covariances
 from teamslam.team.shapes import Float
 

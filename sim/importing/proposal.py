@@ -12,7 +12,7 @@ from teamslam.sim.datasets.csv_table import CsvTable
 from teamslam.sim.datasets.folder_files import ROBOT_NAME
 from teamslam.sim.datasets.folder_tables import DEGREE, POINTS, POLAR, POSES
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.columns import (
+from teamslam.sim.importing.tables import (
     FUSED_WORDS,
     MEASURED,
     REQUIRED,

@@ -21,7 +21,6 @@ from teamslam.sim.datasets.graph import is_graph
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.importing.bag import import_bag, propose_assignment, propose_topics
-from teamslam.sim.importing.columns import MEASURED, ColumnMap, load_map
 from teamslam.sim.importing.files import import_files, map_by_names, read_files, trajectory
 from teamslam.sim.importing.proposal import (
     drops_by_robot,
@@ -29,7 +28,7 @@ from teamslam.sim.importing.proposal import (
     split_by_robot,
     write_proposal,
 )
-from teamslam.sim.importing.tables import Report, RobotTables
+from teamslam.sim.importing.tables import MEASURED, ColumnMap, Report, RobotTables, load_map
 from teamslam.sim.recorded.streams import measurements_in
 from teamslam.sim.scenarios.scenario import Scenario, folder_scenario
 from teamslam.sim.scenarios.source import open_data_set

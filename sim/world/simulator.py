@@ -11,13 +11,20 @@ from itertools import islice
 import numpy as np
 
 from teamslam.sim.world.config import SimulatedWorld, starts_unknown
-from teamslam.sim.world.forms import (
+from teamslam.sim.world.measuring import (
+    SHORTEST_MEASUREMENT_M,
+    Visible,
+    add_outliers,
     draw_covariances,
     measured_increments,
     measured_speeds,
     measured_steering,
+    measurements,
+    on_circle,
+    persistent_errors,
     seen_from,
     slip,
+    visible_points,
     with_errors,
 )
 from teamslam.sim.world.paths import (
@@ -27,15 +34,6 @@ from teamslam.sim.world.paths import (
     Step,
     follow_way_points,
     steer_to_way_points,
-)
-from teamslam.sim.world.sensing import (
-    SHORTEST_MEASUREMENT_M,
-    Visible,
-    add_outliers,
-    measurements,
-    on_circle,
-    persistent_errors,
-    visible_points,
 )
 from teamslam.sim.world.streams import (
     Detections,

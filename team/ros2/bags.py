@@ -18,7 +18,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys.store import Typestore
 
-from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.decoding import types
 
 SUFFIXES = (".mcap", ".db3")
 VERSION: Final = 9  # version of a new bag's metadata, that of ROS 2 Jazzy

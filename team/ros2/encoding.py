@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.decoding import types
 from teamslam.team.shapes import Float
 
 SIGMAS = 2.0

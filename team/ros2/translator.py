@@ -19,8 +19,7 @@ from teamslam.team.ros2.decoding import (
     Transform,
     TransformsRecord,
 )
-from teamslam.team.ros2.frames import BODY, OPTICAL, Frames, Mount, planar
-from teamslam.team.ros2.owners import Owners
+from teamslam.team.ros2.frames import BODY, OPTICAL, Frames, Mount, Owners, planar
 from teamslam.team.ros2.topics import RobotTopics
 
 TAG = re.compile(r"^(?:[^:]*:)?(\d{1,10})$")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.decoding import types
 
 STORE = types()
 T: Any = STORE.types

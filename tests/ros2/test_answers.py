@@ -10,7 +10,7 @@ from rosbags.highlevel import AnyReader
 from teamslam.central.desk.export.rosbag2 import export_rosbag2
 from teamslam.central.desk.paths import smoothed_paths
 from teamslam.central.desk.verification.recorded import index_log
-from teamslam.team.ros2.definitions import types
+from teamslam.team.ros2.decoding import types
 from teamslam.team.ros2.encoding import compose, ellipse, inverse, names_of
 from teamslam.team.ros2.keys import of_rmw, of_token, publication
 from teamslam.team.ros2.topics import RobotTopics

@@ -10,7 +10,7 @@ import pytest
 from teamslam.sim.calibration.data import LEAST_SPANS, SPAN_S, moving_stretches
 from teamslam.sim.cli import launch
 from teamslam.sim.cli.main import load_all
-from teamslam.sim.importing.columns import load_map
+from teamslam.sim.importing.tables import load_map
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.team.config import MotionNoise

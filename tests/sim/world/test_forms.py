@@ -5,14 +5,14 @@ import pytest
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.forms import (
+from teamslam.sim.world.measuring import (
+    Visible,
     draw_covariances,
     measured_increments,
     measured_steering,
     seen_from,
     with_errors,
 )
-from teamslam.sim.world.sensing import Visible
 from teamslam.sim.world.simulator import simulate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.scenarios import with_world
