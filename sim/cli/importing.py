@@ -21,6 +21,7 @@ from teamslam.sim.cli.commands import (
     output_option,
     refuse,
 )
+from teamslam.sim.cli.results import print_table
 from teamslam.team.extras import install_command
 
 app = Group()
@@ -199,18 +200,15 @@ def calibrate(
 
     if find_spec("scipy") is None:
         refuse(f"calibrate needs SciPy: {install_command('calibrate')}")
-    from rich.console import Console
     from rich.table import Table
 
     from teamslam.sim.calibration.calibrate import calibrate_models
     from teamslam.sim.calibration.figures import CalibrationError
     from teamslam.sim.calibration.scenario import scenario_text
-    from teamslam.sim.cli import options as opt
     from teamslam.sim.recorded.streams import measurements_in
     from teamslam.sim.scenarios.scenario import Scenario, builtin_names
     from teamslam.sim.scenarios.source import open_data_set, scenario_beside
     from teamslam.sim.world.streams import WorldStreams
-    from teamslam.team.recording.reader import open_log
 
     if output is not None and output.suffix != ".toml":
         refuse(f"--output {output}: a scenario's name ends in .toml")
@@ -222,7 +220,7 @@ def calibrate(
         click.echo(f"reading {path}", err=True)
         with readable(path) as found_at:
             if found_at.suffix == ".mcap":
-                opt.warn_of_holes(open_log(found_at))
+                opt.open_log(found_at)
                 read.append((path.name, *measurements_in(found_at)))
                 continue
             if not read and scenario is None:
@@ -246,7 +244,7 @@ def calibrate(
         for figure in figures:
             numbers = (f"{figure.value:.5g}", f"{figure.sigma:.2g}")
             table.add_row(part, figure.name, *numbers, figure.unit)
-    Console().print(table)
+    print_table(table)
     for note in found.notes:
         click.echo(note)
     opt.write_json(json_file, asdict(found))

@@ -1,5 +1,6 @@
 """Commands `teamslam launch` and `teamslam localise`."""
 
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from datetime import datetime
@@ -34,8 +35,6 @@ from teamslam.sim.scenarios.scenario import (
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teamslam.central.desk.report.run import Run
     from teamslam.sim.launch.launch import Outcome, Plan
     from teamslam.sim.world.streams import WorldStreams
@@ -178,7 +177,7 @@ def launch(
     with page as at:
         outcome = _launch(plan)
         try:
-            _conclude(resolved, outcome, json_file, report=report)
+            _conclude(outcome, json_file, report=report)
         except KeyboardInterrupt:
             again = f"`teamslam report {outcome.log} -o {outcome.folder}` makes the report"
             fail(f"interrupted: the run is in {outcome.log}; {again}", INTERRUPTED)
@@ -335,33 +334,13 @@ def _keep_earlier(log: Path) -> None:
             part.rename(part_of(aside, number))
 
 
-def _write_report(
-    run: "Run", outcome: "Outcome", figures: dict[str, Any], console: "Console"
-) -> None:
-    from teamslam.central.desk.report.page import write_report
-
-    try:
-        print_written(write_report(run, outcome.folder, figures), console)
-    except OSError as error:
-        outcome.failures.append(
-            f"{outcome.folder}: can not write the report: {error.strerror}; "
-            f"`teamslam report {outcome.log} -o FOLDER` makes it elsewhere"
-        )
-
-
-def _conclude(
-    scenario: Scenario, outcome: "Outcome", json_file: Path | None, *, report: bool
-) -> None:
-    from rich.console import Console
-
+def _conclude(outcome: "Outcome", json_file: Path | None, *, report: bool) -> None:
     from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.names import in_order
-    from teamslam.central.desk.report.run import run_figures
     from teamslam.team.recording.parts import join_parts
     from teamslam.team.recording.reader import LogError, open_log
 
-    console = Console()
     join_parts(outcome.log)  # joined here, where it may take long
     click.echo(f"the run is over: {outcome.end_reason}; scoring it", err=True)
     steps = Steps()
@@ -387,12 +366,9 @@ def _conclude(
         figures = extra
     else:
         figures = to_json(evaluation, extra)
-        print_evaluation(evaluation, console)
+        print_evaluation(evaluation)
         if report:
-            run = read_run(log, evaluation, steps, proves_ledger=False)
-            click.echo("drawing the pictures and writing the report", err=True)
-            print_nis(run, console)
-            _write_report(run, outcome, {**figures, **run_figures(run)}, console)
+            _write_report(read_run(log, evaluation, steps, proves_ledger=False), outcome, figures)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
         outcome.failures += evaluation.disagreement
@@ -400,16 +376,30 @@ def _conclude(
         is_whole = not outcome.failures and len(evaluation.notes) == len(plain.notes)
         if outcome.deaths and is_whole:
             text = "; ".join(outcome.deaths)
-            console.print(f"note: {text}; map and log are whole", markup=False, soft_wrap=True)
+            click.echo(f"note: {text}; map and log are whole")
         else:
             outcome.failures += outcome.deaths
     for name in in_order(outcome.restarts):
         times = outcome.restarts[name]
-        text = f"{name} was started again {times} time{'' if times == 1 else 's'}"
-        console.print(text, highlight=False)
-    console.print(f"log   {outcome.log}", highlight=False, soft_wrap=True)
-    console.print(f"{outcome.wall_s:.1f} s of wall time of the run", highlight=False)
-    console.print(f"show  teamslam view {outcome.log}", highlight=False, soft_wrap=True)
+        click.echo(f"{name} was started again {opt.count_noun(times, 'time')}")
+    click.echo(f"log   {outcome.log}")
+    click.echo(f"{outcome.wall_s:.1f} s of wall time of the run")
+    click.echo(f"show  teamslam view {outcome.log}")
     opt.write_json(json_file, figures)
     if outcome.failures:
         fail("\n".join(outcome.failures))
+
+
+def _write_report(run: "Run", outcome: "Outcome", figures: Mapping[str, Any]) -> None:
+    from teamslam.central.desk.report.page import write_report
+    from teamslam.central.desk.report.run import run_figures
+
+    click.echo("drawing the pictures and writing the report", err=True)
+    print_nis(run.history)
+    try:
+        print_written(write_report(run, outcome.folder, {**figures, **run_figures(run)}))
+    except OSError as error:
+        outcome.failures.append(
+            f"{outcome.folder}: can not write the report: {error.strerror}; "
+            f"`teamslam report {outcome.log} -o FOLDER` makes it elsewhere"
+        )

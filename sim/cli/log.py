@@ -46,12 +46,11 @@ def info(
     from rich.console import Console
     from rich.text import Text
 
-    from teamslam.team.recording.check import holes
     from teamslam.team.recording.editing import summarise_log
     from teamslam.team.recording.reader import open_log
 
     opened = open_log(log)
-    lacks = holes(opened)
+    lacks = opt.warn_of_holes(opened)
     summary = summarise_log(opened)
     span = summary.span_ns()
     console = Console()
@@ -69,7 +68,6 @@ def info(
         console.print(_key_table(summary.keys, span[0], by_key=keys))
     for name, value in opened.metadata.items():
         console.print(Text(one_line(f"{name}: {value}")), no_wrap=True, overflow="ellipsis")
-    opt.tell_holes(log, lacks)
     figures = {
         "log": str(log),
         "team": opened.team,
@@ -119,7 +117,6 @@ def cut(
     import math
 
     from teamslam.team.recording.editing import cut as cut_log
-    from teamslam.team.recording.reader import open_log
 
     bounds = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
     given = [s for s in (from_s, to_s) if s is not None]
@@ -127,8 +124,7 @@ def cut(
         refuse(f"--from {from_s} --to {to_s}: give seconds, the first before the second")
     chosen = _channels(channels)
     opt.refuse_existing(output)
-    opened = open_log(log)
-    opt.warn_of_holes(opened)
+    opened = opt.open_log(log)
     click.echo(f"{output}: {cut_log(opened, output, from_s, to_s, chosen)} messages")
 
 
@@ -144,7 +140,7 @@ def merge(
     opt.refuse_existing(output)
     merged = merge_logs([open_log(log) for log in logs], output)
     click.echo(f"{output}: {merged.messages} messages; {merged.duplicates} duplicates left out")
-    opt.warn_of_holes(open_log(output))
+    opt.open_log(output)
 
 
 @app.declare("teamslam log export runs/first -o paths --format tum")
@@ -165,13 +161,11 @@ def export(
     from teamslam.central.desk.export.rosbag2 import export_rosbag2
     from teamslam.central.desk.export.take_home import export_tum
     from teamslam.sim.recorded.export import export_graph, export_utias
-    from teamslam.team.recording.reader import open_log
 
-    opened = open_log(log)
+    opened = opt.open_log(log)
     chosen = _channels(channels)
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         refuse(f"{output} is there and not an empty folder: give a new one")
-    opt.warn_of_holes(opened)
     if form in ("csv", "parquet"):
         lines = _export_tables(opened, output, chosen, parquet=form == "parquet")
     elif channels is not None:

@@ -183,22 +183,26 @@ def refuse_existing(path: Path) -> None:
         refuse(f"{path} exists: choose another name or remove it")
 
 
-def warn_of_holes(log: "Log") -> None:
-    """Warn of messages that the log lacks."""
-    from teamslam.team.recording.check import holes
+def open_log(path: Path) -> "Log":
+    """Open a log, and warn of messages that it lacks."""
+    from teamslam.team.recording import reader
 
-    tell_holes(log.path, holes(log))
+    log = reader.open_log(path)
+    warn_of_holes(log)
+    return log
 
 
-def tell_holes(path: Path, found: "Sequence[Finding]") -> None:
-    """Warn of these findings."""
-    from teamslam.team.recording.check import MOST_HOLES
+def warn_of_holes(log: "Log") -> "Sequence[Finding]":
+    """Warn of messages that the log lacks; return all findings."""
+    from teamslam.team.recording.check import MOST_HOLES, holes
 
+    found = holes(log)
     for finding in found[:MOST_HOLES]:
-        click.echo(f"warning: {path} is not whole, {one_line(str(finding))}", err=True)
+        click.echo(f"warning: {log.path} is not whole, {one_line(str(finding))}", err=True)
     if len(found) > MOST_HOLES:
         more = count_noun(len(found) - MOST_HOLES, "more finding")
-        click.echo(f"warning: {more}: `teamslam log check {path}` names all", err=True)
+        click.echo(f"warning: {more}: `teamslam log check {log.path}` names all", err=True)
+    return found
 
 
 def fail_if_cut(log: "Log", thing: str) -> None:

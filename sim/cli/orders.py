@@ -17,6 +17,7 @@ from teamslam.sim.cli.commands import (
     refuse,
     refusing,
 )
+from teamslam.sim.cli.results import print_table
 from teamslam.sim.scenarios.scenario import with_options
 from teamslam.team.wire.arrays import ids
 
@@ -150,7 +151,6 @@ def status(
     json_file: opt.JsonFile = None,
 ) -> None:
     """Show the nodes of a running team: rates, clocks, dependencies, and remedies."""
-    from rich.console import Console
     from rich.table import Table
 
     from teamslam.central.desk.presence import Presence
@@ -167,11 +167,10 @@ def status(
     table = Table("node", "there", "state", "measured", "per s", "taken", "clock [s]")
     for row in rows:
         table.add_row(*(_cell(row[name]) for name in row if name != "warnings"))
-    console = Console()
-    console.print(table)
+    print_table(table)
     advice = presence.advice()
     for line in advice:
-        console.print(f"- {line}", markup=False, highlight=False, soft_wrap=True)
+        click.echo(f"- {line}")
     opt.write_json(json_file, {"nodes": rows, "advice": advice})
 
 

@@ -18,7 +18,14 @@ from teamslam.sim.cli.commands import (
     rare,
     refuse,
 )
-from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
+from teamslam.sim.cli.results import (
+    Steps,
+    print_evaluation,
+    print_nis,
+    print_table,
+    print_written,
+    read_run,
+)
 
 PICTURES = "Pictures for a paper or a talk"
 app = Group()
@@ -45,7 +52,6 @@ def replay(
     """Publish a log's traffic again, with equal bytes, order and spacing in team time."""
     from contextlib import nullcontext
 
-    from teamslam.team.recording.reader import open_log
     from teamslam.team.recording.shell import replay as replay_samples
     from teamslam.team.shell import process
     from teamslam.team.wire.zenoh.router import router
@@ -55,8 +61,7 @@ def replay(
         if keys is not None:
             refuse("--keys is for a router that is there: give --connect")
         opt.refuse_open_door(listen, keys=False, insecure=insecure)
-    opened = open_log(log)
-    opt.warn_of_holes(opened)
+    opened = opt.open_log(log)
     hub = router(listen) if connect is None else nullcontext(connect)
     with (
         process("replay") as stop,
@@ -113,8 +118,6 @@ def report(
 
     Exit status 1 if the log is cut: its figures are of the part before the cut.
     """
-    from rich.console import Console
-
     from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.report.page import write_pictures, write_report
@@ -129,28 +132,28 @@ def report(
     steps.begin("scoring the run")
     evaluation = add_holes(evaluate(opened.samples()), opened)
     run = read_run(opened, evaluation, steps, proves_ledger=ledger)
-    console = Console()
     steps.begin("drawing")
     if look or form or picture:
         style = Style(
             look or Look.SCREEN, form or (Form.PDF if look else Form.PNG), picture, width_in
         )
         drawn = write_pictures(run, output, style)
-        print_written(drawn.values(), console)
+        if picture is not None and not drawn:
+            fail(f"{log} has nothing to draw in the picture {picture}")
+        if drawn:
+            print_written(drawn.values())
         if picture is not None:
-            if not drawn:
-                fail(f"{log} has nothing to draw in the picture {picture}")
             return
     figures = to_json(
         evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
     )
-    print_evaluation(evaluation, console)
-    print_nis(run, console)
+    print_evaluation(evaluation)
+    print_nis(run.history)
     if (found := run.ledger) is not None:
         verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()
-        console.print(f"ledger: {verdict}", highlight=False, soft_wrap=True)
+        click.echo(f"ledger: {verdict}")
     try:
-        print_written(write_report(run, output, figures), console)
+        print_written(write_report(run, output, figures))
     except OSError as error:
         fail(f"-o {output}: can not write: {error.strerror}; give another folder")
     opt.write_json(json_file, figures)
@@ -212,13 +215,11 @@ def compare(
 ) -> None:
     """Compare runs side by side: a column for each in a table, and a picture with -o."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     from teamslam.central.desk.compare import compare_figures, compare_picture, compare_rows
     from teamslam.central.desk.evaluation.evaluation import evaluate
-    from teamslam.team.recording.reader import open_log
 
     if len(runs) < FEWEST:
         refuse("one run alone is compared with nothing: give two or more")
@@ -229,16 +230,14 @@ def compare(
         name = path.name if path.is_dir() else path.stem if path.stem != "log" else path.parent.name
         while name in evaluated:
             name += "'"
-        opened = open_log(path)
-        opt.warn_of_holes(opened)
-        evaluated[name] = evaluate(opened.samples())
+        evaluated[name] = evaluate(opt.open_log(path).samples())
     table = Table(box=box.SIMPLE)
     table.add_column("", no_wrap=True)
     for name in evaluated:
         table.add_column(Text(name), justify="right")
     for figure, cells in compare_rows(evaluated):
         table.add_row(Text(figure), *(Text(cell) for cell in cells))
-    Console().print(table)
+    print_table(table)
     if output is not None and compare_picture(evaluated, output):
         click.echo(f"wrote {output}")
     opt.write_json(json_file, compare_figures(evaluated))

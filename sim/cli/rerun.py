@@ -12,12 +12,16 @@ import click
 
 from teamslam.sim.cli import options as opt
 from teamslam.sim.cli.commands import Group, argument, fail, failing, option, output_option, refuse
-from teamslam.sim.cli.results import Steps, print_written, read_run
+from teamslam.sim.cli.results import (
+    Steps,
+    print_nis,
+    print_notes,
+    print_table,
+    print_written,
+    read_run,
+)
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from teamslam.central.desk.evaluation.history import History
     from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.verification.verification import Verification
     from teamslam.sim.recorded.changed_run import Changes
@@ -171,7 +175,6 @@ def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
 
 
 def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Path | None) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -205,16 +208,16 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     table = Table("", *runs)
     for figure, cells in compare_rows(runs):
         table.add_row(Text(figure), *map(Text, cells))
-    console = Console()
-    console.print(table)
-    _print_warnings(recorded, changed, history(computed), console)
+    print_table(table)
+    print_notes(changed.warnings, dict.fromkeys((*recorded.notes, *changed.notes)))
+    print_nis(history(computed))
     same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
     moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
     verdict = "the same bytes" if same else f"another one{moved}"
     if changes.localise:
         verdict = "the saved one, with poses and paths in its frame"
     if not plain:
-        console.print(f"final map: {verdict}", highlight=False)
+        click.echo(f"final map: {verdict}")
     figures = {
         "changes": asdict(changes),
         "same_final_map": same,
@@ -224,9 +227,9 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     }
     opt.write_json(json_file, figures)
     if output is not None:
-        _write_run(computed, changed, output, console)
+        _write_run(computed, changed, output)
         if not plain and draw_maps(runs, output / "maps.png"):
-            console.print(f"wrote {output / 'maps.png'}", highlight=False, soft_wrap=True)
+            click.echo(f"wrote {output / 'maps.png'}")
     if changed.map is None:
         fail("the changed run ended without a final map")
     if failures := changed.failures:
@@ -235,9 +238,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         opt.fail_if_cut(log, "result")
 
 
-def _write_run(
-    computed: "list[Sample]", evaluation: "Evaluation", folder: Path, console: "Console"
-) -> None:
+def _write_run(computed: "list[Sample]", evaluation: "Evaluation", folder: Path) -> None:
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.report.page import write_report
     from teamslam.central.desk.report.run import run_figures
@@ -254,27 +255,14 @@ def _write_run(
     steps = Steps()
     run = read_run(open_log(log), evaluation, steps, proves_ledger=False)
     steps.begin("drawing")
-    print_written(write_report(run, folder, to_json(evaluation, run_figures(run))), console)
-
-
-def _print_warnings(
-    recorded: "Evaluation", changed: "Evaluation", of: "History", console: "Console"
-) -> None:
-    from teamslam.central.desk.report.run import nis_line
-
-    lines = [f"warning: {warning}" for warning in changed.warnings]
-    lines += [f"note: {note}" for note in dict.fromkeys((*recorded.notes, *changed.notes))]
-    for line in (*lines, *filter(None, [nis_line(of)])):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    print_written(write_report(run, folder, to_json(evaluation, run_figures(run))))
 
 
 def _verify(path: Path, json_file: Path | None) -> None:
     from teamslam.central.desk.verification.recorded import RerunError
     from teamslam.central.desk.verification.verification import verify
-    from teamslam.team.recording.reader import open_log
 
-    log = open_log(path)
-    opt.warn_of_holes(log)
+    log = opt.open_log(path)
     began = time.monotonic()
     with failing(RerunError, at=path):
         result = verify(log, _processes())
@@ -297,8 +285,6 @@ def _processes() -> int:
 
 
 def _print_verification(result: "Verification", elapsed_s: float) -> None:
-    from rich.console import Console
-
     from teamslam.central.desk.report.tables import Sheet, terminal_table
 
     counts = (
@@ -307,19 +293,19 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
     )
     rows = [(channel, *(f"{n:,}" for n in numbers)) for channel, *numbers in counts]
     headings = ("channel", "messages", "equal", "within tolerance", "different", "inputs lost")
-    console = Console()
-    console.print(terminal_table(Sheet(headings, rows)))
+    print_table(terminal_table(Sheet(headings, rows)))
     for row in result.channels:
         if row.first is not None:
-            console.print(f"{row.channel}: {row.first}", highlight=False, markup=False)
+            click.echo(f"{row.channel}: {row.first}")
     if result.other_platform:
         from teamslam.central.desk.verification.verification import RELATIVE
 
         differing = ", ".join(result.other_platform)
-        note = f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"
-        console.print(note, highlight=False, markup=False)
+        click.echo(
+            f"another platform ({differing}): numbers compared within {RELATIVE:g}, not bits"
+        )
     if result.unsound:
-        console.print(f"{result.unsound} invalid samples were left out", highlight=False)
+        click.echo(f"{result.unsound} invalid samples were left out")
     different = sum(row.different for row in result.channels)
     lacking = sum(row.lacking for row in result.channels)
     whole = "all" if not lacking else "all others"
@@ -328,11 +314,10 @@ def _print_verification(result: "Verification", elapsed_s: float) -> None:
         verdict = f"{whole} equal within the tolerance"
     if lacking:
         verdict += f", {lacking} can not be judged, since the log lacks their inputs"
-    console.print(
+    click.echo(
         f"{result.messages:,} messages from {result.measurements:,} measurements: {verdict}; "
         f"{elapsed_s:.1f} s for {result.span_s:.0f} s of team time, "
-        f"{result.span_s / elapsed_s:.0f} × real time",
-        highlight=False,
+        f"{result.span_s / elapsed_s:.0f} × real time"
     )
 
 
@@ -345,8 +330,6 @@ def verify_ledger(
     json_file: opt.JsonFile = None,
 ) -> None:
     """Prove that each measurement of a log was used once: its disposition, its submap, its maps."""
-    from rich.console import Console
-
     from teamslam.central.desk.ledger import ledger
     from teamslam.central.desk.names import in_order
     from teamslam.central.desk.report.tables import (
@@ -355,24 +338,20 @@ def verify_ledger(
         terminal_table,
     )
     from teamslam.central.desk.verification.recorded import RerunError, index_log
-    from teamslam.team.recording.reader import open_log
 
-    opened = open_log(log)
-    opt.warn_of_holes(opened)
+    opened = opt.open_log(log)
     with failing(RerunError, at=log):
         found = ledger(index_log(opened))
     robots = in_order({robot for robot, _ in found.entries})
-    console = Console()
-    sheet = disposition_sheet({robot: found.totals(robot) for robot in robots})
-    console.print(terminal_table(sheet))
-    used = sum(1 for maps in found.maps.values() if maps)
-    console.print(f"{len(found.maps)} submaps, {used} of them in a map", highlight=False)
+    sheets = [disposition_sheet({robot: found.totals(robot) for robot in robots})]
     if lists:
-        for listed in rejection_sheets(found):
-            if listed.rows:
-                console.print(terminal_table(listed))
+        sheets += [sheet for sheet in rejection_sheets(found) if sheet.rows]
     elif found.rejected or found.outliers:
-        console.print("--list shows each rejected measurement with its reason", highlight=False)
+        click.echo("--list shows each rejected measurement with its reason")
+    for sheet in sheets:
+        print_table(terminal_table(sheet))
+    used = sum(1 for maps in found.maps.values() if maps)
+    click.echo(f"{len(found.maps)} submaps, {used} of them in a map")
     if not opened.complete:
         click.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
     opt.write_json(json_file, found.to_json())
@@ -380,4 +359,4 @@ def verify_ledger(
         click.secho(offender, fg="red", err=True)
     if found.offenders:
         fail(f"{len(found.offenders)} violations of the ledger")
-    console.print(found.statement(), highlight=False, soft_wrap=True)
+    click.echo(found.statement())

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.table import Table
 
+    from teamslam.central.desk.evaluation.history import History
     from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.report.run import Run
     from teamslam.team.recording.reader import Log
@@ -71,32 +72,41 @@ def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledge
     return Run(evaluation, history(log.samples()), log.metadata, found, why, home, command)
 
 
-def print_evaluation(evaluation: "Evaluation", console: "Console") -> None:
+def print_table(table: "Table") -> None:
+    """Print a table as wide as the terminal."""
+    from rich.console import Console
+
+    Console().print(table)
+
+
+def print_evaluation(evaluation: "Evaluation") -> None:
     """Print tables and notes."""
     from teamslam.central.desk.report.tables import summary_tables
 
     for table in summary_tables(evaluation):
-        console.print(table)
-    for words in evaluation.refused_maps:
-        console.print(f"warning: {words}", markup=False, highlight=False, soft_wrap=True)
-    for note in evaluation.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        print_table(table)
+    print_notes(evaluation.refused_maps, evaluation.notes)
 
 
-def print_nis(run: "Run", console: "Console") -> None:
-    """Print the NIS per degree of freedom, if any."""
-    from teamslam.central.desk.report.run import nis_line
+def print_notes(warnings: Iterable[str], notes: Iterable[str]) -> None:
+    """Print warnings, then notes."""
+    for warning in warnings:
+        click.echo(f"warning: {warning}")
+    for note in notes:
+        click.echo(f"note: {note}")
 
-    if (line := nis_line(run.history)) is not None:
-        console.print(line, highlight=False, soft_wrap=True)
+
+def print_nis(history: "History") -> None:
+    """Print the NIS per degree of freedom of every robot that has one."""
+    per_dof = {name: of.per_dof for name, of in history.innovations.items()}
+    if parts := [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]:
+        click.echo(f"NIS per dof: {', '.join(parts)}")
 
 
-def print_written(paths: Iterable[Path], console: "Console") -> None:
+def print_written(paths: Iterable[Path]) -> None:
     """Print the first written path, and the names of the others."""
-    written = list(paths)
-    others = written[1:]
-    for first in written[:1]:
-        console.print(f"wrote {first}", highlight=False, soft_wrap=True)
+    first, *others = paths
+    click.echo(f"wrote {first}")
     if others:
         names = ", ".join(f"{each.name}/" if each.is_dir() else each.name for each in others)
-        console.print(f"      beside it: {names}", highlight=False)
+        click.echo(f"      beside it: {names}")

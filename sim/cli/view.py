@@ -98,9 +98,7 @@ def view(
         _write_video(log, export_video)
         return
     if not follow or log.exists():
-        opened = open_log(log)
-        if not follow:
-            opt.warn_of_holes(opened)
+        opened = open_log(log) if follow else opt.open_log(log)
         if export is not None or layout is not None:
             _write(opened, export, layout)
             return
@@ -156,7 +154,6 @@ def _has_display() -> bool:
 def _write_video(log: Path, path: Path) -> None:
     from teamslam.central.desk.evaluation.evaluation import evaluate
     from teamslam.central.desk.pictures.film import draw_film, maps_over_time
-    from teamslam.team.recording.reader import open_log
     from teamslam.team.wire.channels import FINAL_MAP, FUSED_MAP
     from teamslam.team.wire.codec import decoded
     from teamslam.team.wire.messages import FusedMap
@@ -164,8 +161,7 @@ def _write_video(log: Path, path: Path) -> None:
     if path.suffix != ".gif" or not path.parent.is_dir():
         refuse(f"--export-video {path}: give a .gif in an existing folder")
     steps = Steps()
-    opened = replace(open_log(log), reading=steps.share)
-    opt.warn_of_holes(opened)
+    opened = replace(opt.open_log(log), reading=steps.share)
     steps.begin("reading the run")
     maps = (decoded(s.payload, FusedMap) for s in opened.samples((FUSED_MAP, FINAL_MAP)))
     evaluation, drawn = evaluate(opened.samples()), maps_over_time(maps)

@@ -42,13 +42,6 @@ class Run:
         return found
 
 
-def nis_line(history: History) -> str | None:
-    """NIS per degree of freedom of every robot in one line."""
-    per_dof = {name: of.per_dof for name, of in history.innovations.items()}
-    parts = [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]
-    return f"NIS per dof: {', '.join(parts)}" if parts else None
-
-
 def run_figures(run: Run) -> dict[str, Any]:
     """Figures that a report adds to an evaluation."""
     history, ledger = run.history, run.ledger

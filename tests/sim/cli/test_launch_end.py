@@ -1,10 +1,8 @@
 import errno
 import os
-from io import StringIO
 
 import pytest
 from click.exceptions import Exit
-from rich.console import Console
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.history import history
@@ -49,7 +47,7 @@ def test_a_full_disk_leaves_the_runs_figures_and_says_how_the_report_is_made_els
 
     monkeypatch.setattr(page, "write_report", full)
     run = Run(evaluate([]), history([]), {})
-    launch._write_report(run, outcome, {}, Console(file=StringIO()))
+    launch._write_report(run, outcome, {})
     (failure,) = outcome.failures
     assert failure == (
         f"{tmp_path}: can not write the report: No space left on device; "
@@ -71,12 +69,12 @@ def test_a_router_killed_as_the_run_ends_is_a_note_where_map_and_log_are_whole(
     death = "router (pid 7) was ended by SIGKILL"
     outcome = Outcome(log=log, folder=tmp_path, wall_s=1.0, processes=[], deaths=[death])
     if lost == "nothing":
-        launch._conclude(of, outcome, None, report=False)
+        launch._conclude(outcome, None, report=False)
         assert f"note: {death}; map and log are whole" in capsys.readouterr().out
         assert outcome.failures == []
     else:
         with pytest.raises(Exit) as ended:
-            launch._conclude(of, outcome, None, report=False)
+            launch._conclude(outcome, None, report=False)
         assert ended.value.exit_code == 1
         assert death in outcome.failures
 
@@ -89,7 +87,7 @@ def test_a_run_whose_map_has_no_landmark_fails_with_the_reason(tmp_path):
         recorder.write(list(run_team(of, streams(of))))
     outcome = Outcome(log=log, folder=tmp_path, wall_s=1.0, processes=[])
     with pytest.raises(Exit) as ended:
-        launch._conclude(of, outcome, None, report=False)
+        launch._conclude(outcome, None, report=False)
     assert ended.value.exit_code == 1
     assert [each for each in outcome.failures if "the final map has no landmark" in each]
     again = commands.output_of("rerun", log, "--noise", "bearing=2", status=1)
