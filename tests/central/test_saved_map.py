@@ -21,7 +21,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.core import unpacked
 from teamslam.team.estimation.map_joining import hypotheses
-from teamslam.team.estimation.map_joining.alignment import align, procrustes
+from teamslam.team.estimation.map_joining.alignment import Maps, align, procrustes
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.saved_map import SavedMapError, map_figures, read_map, write_map
 from teamslam.team.store import SubmapStore
@@ -76,7 +76,7 @@ def errors(fused: m.FusedMap, streams: WorldStreams):
     n = 2 * len(found)
     P = unpacked(floats(fused.covariance, "covariance"), n)
     means = floats(fused.means, "means").reshape(-1, 2)
-    fit = align(truth, 1e-12 * np.eye(n), means, P)
+    fit = align(Maps(truth, 1e-12 * np.eye(n), means, P))
     x, y, turn = procrustes(truth, means, np.ones(len(found)))
     s, c = np.sin(turn), np.cos(turn)
     off = truth - means @ np.array([[c, s], [-s, c]]) - [x, y]

@@ -4,7 +4,7 @@ import numpy as np
 
 from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.alignment import align
+from teamslam.team.estimation.map_joining.alignment import Maps, align
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
@@ -91,7 +91,7 @@ def test_the_alignment_and_its_chi_square_are_consistent():
         P, Q = correlated(np.full(8, 0.3), rng), correlated(np.full(8, 0.2), rng)
         noisy_a = points.ravel() + np.linalg.cholesky(P) @ rng.normal(size=8)
         noisy_b = there.ravel() + np.linalg.cholesky(Q) @ rng.normal(size=8)
-        found = align(noisy_a.reshape(-1, 2), P, noisy_b.reshape(-1, 2), Q)
+        found = align(Maps(noisy_a.reshape(-1, 2), P, noisy_b.reshape(-1, 2), Q))
         error = found.a_from_b - truth
         error[2] = wrap(error[2])
         errors += nees(error, found.covariance)

@@ -20,7 +20,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.core import unpacked
-from teamslam.team.estimation.map_joining.alignment import align, procrustes
+from teamslam.team.estimation.map_joining.alignment import Maps, align, procrustes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import opened
@@ -122,7 +122,7 @@ def _figures(
     truth, rows = places[numbers - 1][known], np.repeat(known, 2)
     means = floats(saved.means, "means").reshape(-1, 2)[known]
     P = unpacked(floats(saved.covariance, "covariance"), len(rows))[np.ix_(rows, rows)]
-    fit = align(truth, 1e-12 * np.eye(len(P)), means, P)
+    fit = align(Maps(truth, 1e-12 * np.eye(len(P)), means, P))
     x, y, turn = procrustes(truth, means, np.ones(len(truth)))
     s, c = np.sin(turn), np.cos(turn)
     off = truth - means @ np.array([[c, s], [-s, c]]) - [x, y]

@@ -37,7 +37,7 @@ from teamslam.team.config import UNNAMED, Sensor
 from teamslam.team.core import unpacked
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import is_map
-from teamslam.team.estimation.map_joining.alignment import align, procrustes
+from teamslam.team.estimation.map_joining.alignment import Maps, align, procrustes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Sample, opened
@@ -87,7 +87,7 @@ def figures(fused: m.FusedMap, world: WorldStreams, labels: Mapping[int, int]) -
     truth, means, count = world.landmarks[rows[known]], means[known], int(known.sum())
     chosen = np.flatnonzero(np.repeat(known, 2))
     P = unpacked(floats(fused.covariance, "covariance"), 2 * len(numbers))[np.ix_(chosen, chosen)]
-    fit = align(truth, 1e-12 * np.eye(len(P)), means, P)
+    fit = align(Maps(truth, 1e-12 * np.eye(len(P)), means, P))
     off = truth - transform_points(np.array(procrustes(truth, means, np.ones(count))), means)
     limit = chi2_limit(fit.dof, 0.025) / fit.dof
     of = dict(zip(own[known].tolist(), world.landmark_ids[rows[known]].tolist(), strict=True))

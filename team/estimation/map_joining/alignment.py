@@ -5,6 +5,7 @@ refines it in the metric of both joint covariances. The joint cost, which is not
 drifted map, tests the agreement.
 """
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +15,41 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import deviation, information
 from teamslam.team.estimation.se2 import wrapped
-from teamslam.team.shapes import Float
+from teamslam.team.shapes import Bool, Float
 
 ITERATIONS = 10
 NEEDED = 2  # number of points that determine a rigid motion in the plane
+LEAST_AGREEING = 3  # fewest landmarks that must agree where others disagree
+MOST_PAIRS = 2000  # most pairs of shared landmarks from which a frame is proposed
+
+
+class Maps(NamedTuple):
+    """Two independent Gaussian maps of the same n landmarks [m], N(a, A) and N(b, B), m = 2n."""
+
+    a: Float[np.ndarray, "n 2"]
+    A: Float[np.ndarray, "m m"]
+    b: Float[np.ndarray, "n 2"]
+    B: Float[np.ndarray, "m m"]
+
+    def select(self, which: Bool[np.ndarray, " n"]) -> "Maps":
+        """Select landmarks."""
+        both = np.repeat(which, 2)
+        of = np.ix_(both, both)
+        return Maps(self.a[which], self.A[of], self.b[which], self.B[of])
+
+    def differences(
+        self, a_from_b: Float[np.ndarray, "3"]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
+        """Compute d = a − (R b + t), its covariance A + R B Rᵀ, and J = ∂(R b + t)/∂(t, θ)."""
+        n = len(self.a)
+        s, c = core.sin_and_cos(a_from_b[2])
+        R = np.array([[c, -s], [s, c]])
+        turned = dense.product(self.b, R.T)
+        D = self.A + dense.congruent(np.kron(np.eye(n), R), self.B)
+        J = np.zeros((2 * n, 3))
+        J[0::2, 0] = J[1::2, 1] = 1.0
+        J[0::2, 2], J[1::2, 2] = -turned[:, 1], turned[:, 0]
+        return (self.a - turned - a_from_b[:2]).ravel(), D, J
 
 
 class Alignment(NamedTuple):
@@ -53,71 +85,55 @@ def procrustes(
     return np.array([mean_a[0] - x, mean_a[1] - y, turn])
 
 
-def align(
-    in_a: Float[np.ndarray, "n 2"],
-    covariance_a: Float[np.ndarray, "m m"],
-    in_b: Float[np.ndarray, "n 2"],
-    covariance_b: Float[np.ndarray, "m m"],
-) -> Alignment:
-    """Estimate the most likely a_from_b of two independent Gaussian maps of the same n ≥ 2
-    landmarks.
+def align(maps: Maps) -> Alignment:
+    """Estimate the most likely a_from_b of maps of n ≥ 2 landmarks.
 
-    Minimises dᵀ(P_a + R P_b Rᵀ)⁻¹d, d = a − (R b + t), about the centroids, with the metric of each
+    Minimises dᵀ(A + R B Rᵀ)⁻¹d, d = a − (R b + t), about the centroids, with the metric of each
     iterate. If the points coincide, the heading is 0 and `heading_sigma` infinite. Raises
     NotACovarianceError.
     """
-    n = len(in_a)
-    variances = np.diag(covariance_a) + np.diag(covariance_b)
-    of_a, of_b = in_a.mean(axis=0), in_b.mean(axis=0)
-    near_a, near_b = in_a - of_a, in_b - of_b
-    if not near_b.any():
-        return _at_one_place(of_a - of_b, n)
-    about = procrustes(near_a, near_b, 1.0 / variances.reshape(n, 2).sum(axis=1))
+    a, A, b, B = maps
+    dof = 2 * len(a) - 3
+    of_a, of_b = a.mean(axis=0), b.mean(axis=0)
+    near = Maps(a - of_a, A, b - of_b, B)
+    if not near.b.any():
+        unknown = np.full((3, 3), np.inf)
+        return Alignment(np.array([*(of_a - of_b), 0.0]), unknown, np.inf, dof, np.inf)
+    variances = np.diag(A) + np.diag(B)
+    about = procrustes(near.a, near.b, 1.0 / variances.reshape(-1, 2).sum(axis=1))
     for _ in range(ITERATIONS):
-        residual, metric, jacobian = _linearise(about, near_a, covariance_a, near_b, covariance_b)
-        spread = information(
-            dense.product(dense.product(jacobian.T, metric), jacobian), "an alignment"
-        )
-        about = about + dense.product(
-            spread, dense.product(jacobian.T, dense.product(metric, residual))
-        )
+        residual, metric, J = _linearise(near, about)
+        spread = information(dense.congruent(J.T, metric), "an alignment")
+        slope = dense.product(J.T, dense.product(metric, residual))
+        about = about + dense.product(spread, slope)
         about[2] = wrapped(about[2])
-    residual, metric, jacobian = _linearise(about, near_a, covariance_a, near_b, covariance_b)
-    spread = information(dense.product(dense.product(jacobian.T, metric), jacobian), "an alignment")
-    chi2 = float(dense.product(dense.product(residual, metric), residual))
+    residual, metric, J = _linearise(near, about)
+    spread = information(dense.congruent(J.T, metric), "an alignment")
     difference = information(metric, "the metric of an alignment")
-    sigma = _shape_heading_sigma(near_b, jacobian, difference)
+    sigma = _shape_heading_sigma(near.b, J, difference)
     s, c = core.sin_and_cos(about[2])
     x, y = c * of_b[0] - s * of_b[1], s * of_b[0] + c * of_b[1]
     a_from_b = np.array([of_a[0] + about[0] - x, of_a[1] + about[1] - y, about[2]])
     lever = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [0.0, 0.0, 1.0]])
-    return Alignment(
-        a_from_b, dense.product(dense.product(lever, spread), lever.T), chi2, 2 * n - 3, sigma
-    )
+    chi2 = dense.quadratic(metric, residual)
+    return Alignment(a_from_b, dense.congruent(lever, spread), chi2, dof, sigma)
 
 
-def _at_one_place(shift: Float[np.ndarray, "2"], n: int) -> Alignment:
-    unknown = np.full((3, 3), np.inf)
-    return Alignment(np.array([*shift, 0.0]), unknown, np.inf, 2 * n - 3, np.inf)
-
-
-def fit_at_heading(
-    in_a: Float[np.ndarray, "n 2"],
-    covariance_a: Float[np.ndarray, "m m"],
-    in_b: Float[np.ndarray, "n 2"],
-    covariance_b: Float[np.ndarray, "m m"],
-    heading: float,
-) -> tuple[Float[np.ndarray, "2"], float]:
+def fit_at_heading(maps: Maps, heading: float) -> tuple[Float[np.ndarray, "2"], float]:
     """Fit the translation [m] of a_from_b at a given heading; return it with its χ²."""
-    pose = np.array([0.0, 0.0, heading])
-    residual, metric, jacobian = _linearise(pose, in_a, covariance_a, in_b, covariance_b)
+    residual, metric, jacobian = _linearise(maps, np.array([0.0, 0.0, heading]))
     J = jacobian[:, :2]
-    shift = dense.solve(
-        dense.product(dense.product(J.T, metric), J),
-        dense.product(J.T, dense.product(metric, residual)),
-    )
-    left = residual - dense.product(J, shift)
-    return shift, float(dense.product(dense.product(left, metric), left))
+    slope = dense.product(J.T, dense.product(metric, residual))
+    shift = dense.solve(dense.congruent(J.T, metric), slope)
+    return shift, dense.quadratic(metric, residual - dense.product(J, shift))
+
+
+def _linearise(
+    maps: Maps, a_from_b: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
+    """Return the differences d, (A + R B Rᵀ)⁻¹ and ∂(R b + t)/∂(t, θ)."""
+    d, D, J = maps.differences(a_from_b)
+    return d, information(D, "the shared landmarks of two maps"), J
 
 
 def _shape_heading_sigma(
@@ -127,34 +143,110 @@ def _shape_heading_sigma(
 ) -> float:
     squares = dense.product(jacobian.T, jacobian)
     shape = np.eye(len(jacobian)) - dense.product(jacobian, dense.solve(squares, jacobian.T))
-    variance = np.trace(dense.product(dense.product(shape, covariance), shape)) / (
-        len(jacobian) - 3
-    )
+    spread = dense.product(dense.product(shape, covariance), shape)
+    variance = np.trace(spread) / (len(jacobian) - 3)
     extent = float((core.squared(in_b - in_b.mean(axis=0))).sum())
     return deviation(variance / extent)
 
 
-def _linearise(
-    a_from_b: Float[np.ndarray, "3"],
-    in_a: Float[np.ndarray, "n 2"],
-    covariance_a: Float[np.ndarray, "m m"],
-    in_b: Float[np.ndarray, "n 2"],
-    covariance_b: Float[np.ndarray, "m m"],
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m m"], Float[np.ndarray, "m 3"]]:
-    """Return the differences d, (P_a + R P_b Rᵀ)⁻¹ and ∂(R b + t)/∂(t, θ)."""
-    n = len(in_a)
-    s, c = core.sin_and_cos(a_from_b[2])
-    rotation = np.array([[c, -s], [s, c]])
-    turned = dense.product(in_b, rotation.T)
-    all_turned = np.kron(np.eye(n), rotation)
-    metric = information(
-        covariance_a + dense.product(dense.product(all_turned, covariance_b), all_turned.T),
-        "the shared landmarks of two maps",
-    )
-    jacobian = np.zeros((2 * n, 3))
-    jacobian[0::2, 0] = jacobian[1::2, 1] = 1.0
-    jacobian[0::2, 2], jacobian[1::2, 2] = -turned[:, 1], turned[:, 0]
-    return (in_a - turned - a_from_b[:2]).ravel(), metric, jacobian
+def agreeing(maps: Maps, limit: float) -> Bool[np.ndarray, " n"]:
+    """Mark the landmarks of two maps that one rigid motion places.
+
+    From the largest set by the motion of a pair, those whose χ² exceeds the limit are removed, the
+    worst first, and those that agree are added.
+    """
+    agree = np.ones(len(maps.a), np.bool_)
+    if _disagreements(maps, agree).max() > limit:
+        agree = _largest_agreement(maps, limit)
+        if agree.sum() < LEAST_AGREEING:
+            return agree
+    for _ in range(len(agree)):
+        chi2 = _disagreements(maps, agree)
+        worst = int(np.argmax(np.where(agree, chi2, -np.inf)))
+        if chi2[worst] > limit and agree.sum() > LEAST_AGREEING:
+            agree[worst] = False
+            continue
+        best = int(np.argmin(np.where(agree, np.inf, chi2)))
+        if agree[best] or chi2[best] > limit:
+            break
+        agree[best] = True
+    return agree
+
+
+def _largest_agreement(maps: Maps, limit: float) -> Bool[np.ndarray, " n"]:
+    """Mark the most landmarks that the rigid motion of one pair places within the limit.
+
+    The motion from i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps middle to middle.
+    """
+    a, A, b, B = maps
+    best = np.zeros(len(a), np.bool_)
+    pairs = list(combinations(range(len(a)), 2))
+    for i, j in pairs[:: -(-len(pairs) // MOST_PAIRS)]:
+        to, of = a[j] - a[i], b[j] - b[i]
+        turn = core.atan2(to[1], to[0]) - core.atan2(of[1], of[0])
+        s, c = core.sin_and_cos(turn)
+        R = np.array([[c, -s], [s, c]])
+        d = a - 0.5 * (a[i] + a[j]) - dense.product(b - 0.5 * (b[i] + b[j]), R.T)
+        P = _relative(A, i, j) + _turned(_relative(B, i, j), s, c)
+        # The direction of the pair is uncertain across it; far from the pair by as much more.
+        far = core.hypot(*(a - 0.5 * (a[i] + a[j])).T) / max(core.hypot(*to), 1e-12)
+        P = P + core.squared(far)[:, None, None] * (P[i] + P[j])
+        x, y = d.T
+        xx, xy, yy = P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]
+        chi2 = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * P[:, 1, 0])
+        agree = chi2 <= limit
+        if agree.sum() > best.sum():
+            best = agree
+    return best
+
+
+def _relative(P: Float[np.ndarray, "m m"], i: int, j: int) -> Float[np.ndarray, "n 2 2"]:
+    """Compute the covariance of each landmark relative to the middle of i and j."""
+    n = len(P) // 2
+    grid = P.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
+    own = grid[np.arange(n), np.arange(n)]
+    middle = 0.25 * (grid[i, i] + grid[i, j] + grid[j, i] + grid[j, j])
+    cross = 0.5 * (grid[:, i] + grid[:, j])
+    found: Float[np.ndarray, "n 2 2"] = own + middle - cross - cross.transpose(0, 2, 1)
+    return found
+
+
+def _turned(P: Float[np.ndarray, "n 2 2"], s: float, c: float) -> Float[np.ndarray, "n 2 2"]:
+    xx, xy, yy = P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]
+    across = 2.0 * c * s * xy
+    x, y = c * c * xx - across + s * s * yy, s * s * xx + across + c * c * yy
+    between = c * s * (xx - yy) + (c * c - s * s) * xy
+    found: Float[np.ndarray, "n 2 2"] = np.stack([x, between, between, y], axis=1).reshape(-1, 2, 2)
+    return found
+
+
+def _disagreements(maps: Maps, agree: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Compute each landmark's χ² of two degrees of freedom against those that agree.
+
+    With the difference d at the motion of the agreeing landmarks I, its covariance D, and J by the
+    motion, of covariance N: in I, g = W d_I, M = W − W J_I N J_Iᵀ W, W = D_II⁻¹, and χ² = g_iᵀ
+    M_ii⁻¹ g_i (Baarda 1968); any other k is predicted as D_kI D_II⁻¹ d_I.
+    """
+    inside = np.repeat(agree, 2)
+    d, D, J = maps.differences(align(maps.select(agree)).a_from_b)
+    W = information(D[np.ix_(inside, inside)], "the shared landmarks of two maps")
+    gain = dense.product(D[:, inside], W)
+    along = dense.product(W, J[inside])
+    N = information(dense.product(J[inside].T, along), "the motion between two maps")
+    M = W - dense.congruent(along, N)
+    g = dense.product(W, d[inside])
+    G = J - dense.product(gain, J[inside])
+    e = d - dense.product(gain, d[inside])
+    S = D - dense.product(gain, D[inside]) + dense.congruent(G, N)
+    found = np.empty(len(agree))
+    place = np.cumsum(agree) - 1
+    for k, is_inside in enumerate(agree.tolist()):
+        at = 2 * int(place[k]) if is_inside else 2 * k
+        block, own = (M, g) if is_inside else (S, e)
+        two = slice(at, at + 2)
+        metric = information(0.5 * (block[two, two] + block[two, two].T), "a difference")
+        found[k] = dense.quadratic(metric, own[two])
+    return found
 
 
 class SharedPoints(NamedTuple):

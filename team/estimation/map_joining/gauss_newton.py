@@ -188,6 +188,15 @@ class Island:
         except core.NotPositiveDefiniteError as error:
             raise NotDeterminedError(self.graph.name(error.variable)) from error
 
+    def value(self, node: int) -> Values:
+        """Return the state of a node."""
+        return self.state[self.graph.offset[node] : self.graph.offset[node + 1]]
+
+    def points(self, nodes: Sequence[int] | Int64[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+        """Return the positions [m] of nodes."""
+        at = self.graph.offset[np.asarray(nodes, np.int64)]
+        return np.column_stack([self.state[at], self.state[at + 1]])
+
     def moved(self, step: Values, older: int = 1) -> "Island":
         """Add `step` to the state, headings wrapped to (−π, π], and `older` to the ages."""
         state = self.state + step

@@ -13,9 +13,12 @@ from teamslam.team.core import WholeMap
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.map_joining.alignment import (
+    LEAST_AGREEING,
     NEEDED,
     Alignment,
+    Maps,
     SharedPoints,
+    agreeing,
     align,
     disagreement,
     refusal,
@@ -26,7 +29,6 @@ from teamslam.team.estimation.map_joining.conditioning import (
     join_submap,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.saved_maps import LEAST_AGREEING, agreeing
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, Int64, UInt32
 
@@ -60,7 +62,7 @@ def locate_robot(
     count, refused = len(in_team), 0
     if fit is not None and why is not None and count > LEAST_AGREEING:
         limit = chi2_limit(2, 1.0 - SETTINGS.alignment_confidence)
-        agree = agreeing(shared.a, shared.A, shared.b, shared.P[3:, 3:], limit)
+        agree = agreeing(shared.maps, limit)
         refused = count - int(agree.sum())
         if count - refused >= LEAST_AGREEING and 2 * refused < count:
             shared = _Shared.of(team, whole, in_team[agree], in_own[agree])
@@ -103,13 +105,12 @@ class _Shared(NamedTuple):
         )
 
     @property
-    def b(self) -> Float[np.ndarray, "n 2"]:
-        return self.mean[3:].reshape(-1, 2)
+    def maps(self) -> Maps:
+        return Maps(self.a, self.A, self.mean[3:].reshape(-1, 2), self.P[3:, 3:])
 
     def fit(self) -> tuple[Alignment | None, str | None]:
-        shared, fit = SharedPoints(len(self.ids)), None
-        if len(self.ids) >= NEEDED:
-            fit = align(self.a, self.A, self.b, self.P[3:, 3:])
+        shared = SharedPoints(len(self.ids))
+        fit = align(self.maps) if len(self.ids) >= NEEDED else None
         why = refusal(shared, fit, HEADING_SIGMA)
         if why is None and fit is not None:
             why = disagreement(shared, fit.chi2, SETTINGS.alignment_confidence)

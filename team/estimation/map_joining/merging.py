@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -21,9 +22,15 @@ from teamslam.team import core
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import UNSOLVABLE, deviation
-from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.inter_robot import InterRobotFactor, SightingKey
 from teamslam.team.estimation.map_joining import alignment
-from teamslam.team.estimation.map_joining.alignment import Alignment, SharedPoints
+from teamslam.team.estimation.map_joining.alignment import (
+    LEAST_AGREEING,
+    Alignment,
+    Maps,
+    SharedPoints,
+    agreeing,
+)
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     add_sightings,
@@ -38,8 +45,6 @@ from teamslam.team.estimation.map_joining.minima import (
     solve_minimum,
 )
 from teamslam.team.estimation.map_joining.saved_maps import (
-    LEAST_AGREEING,
-    agreeing,
     disagreeing,
     maps_of,
     separate,
@@ -89,38 +94,31 @@ def ties(main: Graph, other: Graph, sightings: Sequence[InterRobotFactor]) -> li
     return found
 
 
-def sound_ties(
+def _unused_fixes(
     main: Island, other: Island, tied: Sequence[SharedPoint]
-) -> tuple[list[SharedPoint], list[InterRobotFactor]]:
-    """Return the points that align islands, and the fixes left out.
-
-    At most MOST_FIXES fixes, evenly spaced in time, of which outliers of the common rigid motion
-    are removed.
+) -> frozenset[SightingKey]:
+    """List the fixes that do not align islands: all but MOST_FIXES, evenly spaced in time, and
+    outliers of their common rigid motion.
     """
-    every = [each for each in tied if each.seen is not None and each.seen.is_fix]
+    every = {each.seen.key: each for each in tied if each.seen is not None and each.seen.is_fix}
     if len(every) <= LEAST_AGREEING:
-        return list(tied), []
-    fixes = every[:: -(-len(every) // MOST_FIXES)]
-    in_main = _points(main, [(t.main, t.seen, t.from_main) for t in fixes])
-    in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in fixes])
+        return frozenset()
+    keys = list(every)[:: -(-len(every) // MOST_FIXES)]
     limit = chi2_limit(2, 1.0 - main.settings.alignment_confidence)
-    agree = agreeing(*in_main, *in_other, limit).tolist()
-    sound = {id(each) for each, is_one in zip(fixes, agree, strict=True) if is_one}
-    aside = [each for each in every if id(each) not in sound]
-    out = {id(each) for each in aside}
-    seen = [each.seen for each in aside if each.seen is not None]
-    return [each for each in tied if id(each) not in out], seen
+    agree = agreeing(_shared_maps(main, other, [every[key] for key in keys]), limit)
+    return frozenset(every).difference(compress(keys, agree))
 
 
-def aligned_by(
-    main: Island, other: Island, tied: Sequence[SharedPoint]
-) -> alignment.Alignment | None:
-    """Align the other island with the main one; None with too few points."""
+def _align(main: Island, other: Island, tied: Sequence[SharedPoint]) -> Alignment | None:
     if len(tied) < alignment.NEEDED:
         return None
+    return alignment.align(_shared_maps(main, other, tied))
+
+
+def _shared_maps(main: Island, other: Island, tied: Sequence[SharedPoint]) -> Maps:
     in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
     in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in tied])
-    return alignment.align(*in_main, *in_other)
+    return Maps(*in_main, *in_other)
 
 
 def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None, bool]]) -> JointPoints:
@@ -149,12 +147,12 @@ def _points(island: Island, at: Sequence[tuple[int, InterRobotFactor | None, boo
             direction = core.atan2(y, x)
             s, c = core.sin_and_cos(direction)
             polar = np.array([[c, -distance * s], [s, distance * c]])
-            noise[rows, rows] = dense.product(dense.product(polar, seen.covariance), polar.T)
+            noise[rows, rows] = dense.congruent(polar, seen.covariance)
         begin += int(island.graph.offset[node + 1] - island.graph.offset[node])
-    return points, dense.product(dense.product(J, covariance), J.T) + noise
+    return points, dense.congruent(J, covariance) + noise
 
 
-def headings_that_fit(
+def _headings_that_fit(
     main: Island, other: Island, tied: Sequence[SharedPoint]
 ) -> list[Float[np.ndarray, "3"]]:
     """Find every main_from_other whose heading is a local minimum of the shared points' χ².
@@ -163,10 +161,9 @@ def headings_that_fit(
     """
     if not alignment.NEEDED <= len(tied) <= MOST_POINTS:
         return []
-    in_main = _points(main, [(t.main, t.seen, t.from_main) for t in tied])
-    in_other = _points(other, [(t.other, t.seen, not t.from_main) for t in tied])
+    maps = _shared_maps(main, other, tied)
     grid = [2.0 * math.pi * k / HEADINGS - math.pi for k in range(HEADINGS)]
-    found = [alignment.fit_at_heading(*in_main, *in_other, heading) for heading in grid]
+    found = [alignment.fit_at_heading(maps, heading) for heading in grid]
     costs = [chi2 for _, chi2 in found]
     limit = min(costs) + HOPELESS
     return [
@@ -214,12 +211,14 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     if isinstance(apart, Waits):
         return apart
     main, other = apart
-    tied, aside = sound_ties(main, other, ties(main.graph, other.graph, waiting))
-    out = {each.key for each in aside}
-    waiting = [each for each in waiting if each.key not in out]
+    tied = ties(main.graph, other.graph, waiting)
+    unused = _unused_fixes(main, other, tied)
+    tied = [tie for tie in tied if tie.seen is None or tie.seen.key not in unused]
+    aside = [each for each in waiting if each.key in unused]
+    waiting = [each for each in waiting if each.key not in unused]
     seen = sum(tie.seen is not None for tie in tied)
     shared = SharedPoints(len(tied) - seen, seen)
-    found = aligned_by(main, other, tied)
+    found = _align(main, other, tied)
     why = alignment.refusal(shared, found, main.settings.alignment_heading_sigma)
     if found is None or why is not None:
         return Waits(why or str(shared), after_search=False)
@@ -230,7 +229,7 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     ]
     search = search_minima([both, *(replace(both, state=each.state) for each in others)])
     rise = search.best.cost - solve_minimum(main).cost - solve_minimum(other).cost
-    # Fixes whose errors drift agree with the alignment one by one (`sound_ties`), not together.
+    # Fixes whose errors drift agree with the alignment one by one (`_unused_fixes`), not together.
     are_fixes = all(tie.seen is not None and tie.seen.is_fix for tie in tied)
     if not are_fixes:
         why = alignment.disagreement(shared, rise, main.settings.alignment_confidence)
@@ -286,18 +285,13 @@ def _propose_places(
     if by_landmarks and by_sightings:
         for some in (by_landmarks, by_sightings):
             with suppress(*UNSOLVABLE):
-                proposed.append(aligned_by(main, other, some))
+                proposed.append(_align(main, other, some))
     places = [found.a_from_b for found in proposed if found is not None]
-    return [*places, *headings_that_fit(main, other, tied)]
-
-
-def _frame_place(island: Island, node: int) -> Float[np.ndarray, "3"]:
-    begin = island.graph.offset[node]
-    return island.state[begin : begin + 3]
+    return [*places, *_headings_that_fit(main, other, tied)]
 
 
 def _describe_ambiguity(shared: SharedPoints, search: Search, second: Minimum, node: int) -> str:
-    away = _frame_place(second.island, node) - _frame_place(search.best.island, node)
+    away = second.island.value(node) - search.best.island.value(node)
     return (
         f"{shared} leave two places {core.hypot(away[0], away[1]):.1f} m apart: "
         f"chi² of one is only {second.cost - search.best.cost:.1f} more"

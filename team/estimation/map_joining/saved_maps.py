@@ -14,7 +14,7 @@ neighbour, so two submaps are needed to move it, and the association of one is u
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
-from itertools import combinations, count
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.contribution import RobotBias, Stream, is_map, named
 from teamslam.team.estimation.gaussian import deviation, information
-from teamslam.team.estimation.map_joining.alignment import align
+from teamslam.team.estimation.map_joining.alignment import LEAST_AGREEING, Maps, agreeing
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.submap_graph import (
     Graph,
@@ -34,7 +34,7 @@ from teamslam.team.estimation.map_joining.submap_graph import (
     tie_landmarks,
 )
 from teamslam.team.estimation.se2 import transformed
-from teamslam.team.shapes import Bool, Float
+from teamslam.team.shapes import Float
 
 FALSE_ALARM = 1e-3  # probability that an unmoved landmark counts as moved in the final map
 SEQUENTIAL = 1e-6  # the same of one test in a running map, repeated with every tick
@@ -45,8 +45,6 @@ LEAST_SUBMAPS = 2
 former place is empty.
 """
 REMEDY = "load the right map, or save a new one"  # for a saved map that does not join
-LEAST_AGREEING = 3  # fewest landmarks that must agree where others disagree
-MOST_PAIRS = 2000  # most pairs of shared landmarks from which a frame is proposed
 
 
 class Displacement(NamedTuple):
@@ -138,8 +136,7 @@ def _tests(
     s, c = core.sin_and_cos(state[start + 2])
     rotation = np.array([[c, -s], [s, c]])
     at = graph.offset[saved.landmarks]
-    points = np.column_stack([state[at], state[at + 1]])
-    inside = dense.product(points - state[start : start + 2], rotation)
+    inside = dense.product(island.points(saved.landmarks) - state[start : start + 2], rotation)
     bias_at = graph.offset[saved.nodes[len(saved.nodes) - len(saved.biases) :]]
     shifts = saved.sensitivity[:, 3:] if len(saved.biases) else np.zeros((0, len(W)))
     z = saved.contribution.local.landmarks.ravel()
@@ -168,8 +165,7 @@ def _tests(
         P = information(block, "a displacement")
         e = dense.product(P, g[2 * k : 2 * k + 2])
         chi2 = float(dense.product(e, g[2 * k : 2 * k + 2]))
-        turned = dense.product(dense.product(rotation, P), rotation.T)
-        found.append((-dense.product(rotation, e), turned, chi2))
+        found.append((-dense.product(rotation, e), dense.congruent(rotation, P), chi2))
     return found
 
 
@@ -184,8 +180,7 @@ def _apart(island: Island, id_: int, former: int, present: int) -> Displacement:
     by = mean[2:] - mean[:2]
     covariance = P[:2, :2] + P[2:, 2:] - P[:2, 2:] - P[2:, :2]
     metric = information(covariance, f"the displacement of landmark {id_}")
-    chi2 = float(dense.product(dense.product(by, metric), by))
-    return Displacement(id_, by, covariance, chi2, is_apart=True)
+    return Displacement(id_, by, covariance, dense.quadratic(metric, by), is_apart=True)
 
 
 def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
@@ -194,11 +189,10 @@ def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
     stream = saved.contribution.stream
     nodes = {node: k for k, node in enumerate(saved.landmarks.tolist())}
     by_others = _observed_by_others(graph, saved)
-    start = int(graph.offset[saved.nodes[0]])
+    start = island.value(saved.nodes[0])
     for id_ in sorted(ids):
         node = graph.landmarks[id_]
-        local = saved.contribution.local.landmarks[nodes[node]]
-        value = transformed(state[start : start + 3], local)
+        value = transformed(start, saved.contribution.local.landmarks[nodes[node]])
         graph, state = add_former_place(graph, state, stream, id_, value, shared=node in by_others)
     return replace(island, graph=graph, state=state)
 
@@ -307,152 +301,16 @@ def disagreeing(
 
     Returns the reason if no more than half agree within `confidence`.
     """
-    n = len(ids)
-    in_main = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
-    in_other = joint_marginal(other, [other.graph.landmarks[id_] for id_ in ids])
-    a, b = in_main[0].reshape(-1, 2), in_other[0].reshape(-1, 2)
-    agree = agreeing(a, in_main[1], b, in_other[1], chi2_limit(2, 1.0 - confidence))
-    count = int(agree.sum())
-    if count < LEAST_AGREEING or 2 * count <= n:
-        return _refusal(main, other, n, count)
+    a, A = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
+    b, B = joint_marginal(other, [other.graph.landmarks[id_] for id_ in ids])
+    maps = Maps(a.reshape(-1, 2), A, b.reshape(-1, 2), B)
+    agree = agreeing(maps, chi2_limit(2, 1.0 - confidence))
+    same = int(agree.sum())
+    if same < LEAST_AGREEING or 2 * same <= len(ids):
+        of = next(each for island in (main, other) for each in maps_of(island.graph))
+        return (
+            f"{len(ids)} shared landmarks disagree: of {named(of.contribution.stream)} no more "
+            f"than {same} are at one place; it is the map of another site, or half of the site has "
+            f"changed: {REMEDY}"
+        )
     return [id_ for id_, is_same in zip(ids, agree.tolist(), strict=True) if not is_same]
-
-
-def agreeing(
-    a: Float[np.ndarray, "n 2"],
-    A: Float[np.ndarray, "m m"],
-    b: Float[np.ndarray, "n 2"],
-    B: Float[np.ndarray, "m m"],
-    limit: float,
-) -> Bool[np.ndarray, " n"]:
-    """Mark the landmarks of two maps, N(a, A) and N(b, B), that one rigid motion places.
-
-    From the largest set by the motion of a pair, those that disagree are removed, the worst first,
-    and those that agree are added.
-    """
-    agree = np.ones(len(a), np.bool_)
-    if _disagreements(a, A, b, B, agree).max() > limit:
-        agree = _largest_agreement(a, A, b, B, limit)
-        if agree.sum() < LEAST_AGREEING:
-            return agree
-    for _ in range(len(a)):
-        chi2 = _disagreements(a, A, b, B, agree)
-        worst = int(np.argmax(np.where(agree, chi2, -np.inf)))
-        if chi2[worst] > limit and agree.sum() > LEAST_AGREEING:
-            agree[worst] = False
-            continue
-        best = int(np.argmin(np.where(agree, np.inf, chi2)))
-        if agree[best] or chi2[best] > limit:
-            break
-        agree[best] = True
-    return agree
-
-
-def _refusal(main: Island, other: Island, shared: int, agreeing: int) -> str:
-    of = next(each for island in (main, other) for each in maps_of(island.graph))
-    return (
-        f"{shared} shared landmarks disagree: of {named(of.contribution.stream)} no more than "
-        f"{agreeing} are at one place; it is the map of another site, or half of the site has "
-        f"changed: {REMEDY}"
-    )
-
-
-def _largest_agreement(
-    a: Float[np.ndarray, "n 2"],
-    A: Float[np.ndarray, "m m"],
-    b: Float[np.ndarray, "n 2"],
-    B: Float[np.ndarray, "m m"],
-    limit: float,
-) -> Bool[np.ndarray, " n"]:
-    """Mark the most landmarks that the rigid motion of one pair places within the limit.
-
-    The motion from i and j turns bⱼ − bᵢ to aⱼ − aᵢ and maps middle to middle.
-    """
-    n = len(a)
-    best = np.zeros(n, np.bool_)
-    pairs = list(combinations(range(n), 2))
-    for i, j in pairs[:: -(-len(pairs) // MOST_PAIRS)]:
-        to, of = a[j] - a[i], b[j] - b[i]
-        turn = core.atan2(to[1], to[0]) - core.atan2(of[1], of[0])
-        s, c = core.sin_and_cos(turn)
-        R = np.array([[c, -s], [s, c]])
-        d = a - 0.5 * (a[i] + a[j]) - dense.product(b - 0.5 * (b[i] + b[j]), R.T)
-        P = _relative(A, i, j) + _turned(_relative(B, i, j), s, c)
-        # The direction of the pair is uncertain across it; far from the pair by as much more.
-        far = core.hypot(*(a - 0.5 * (a[i] + a[j])).T) / max(core.hypot(*to), 1e-12)
-        spread = P[i] + P[j]
-        P = P + core.squared(far)[:, None, None] * spread
-        determinant = P[:, 0, 0] * P[:, 1, 1] - P[:, 0, 1] * P[:, 1, 0]
-        chi2 = (
-            P[:, 1, 1] * d[:, 0] * d[:, 0]
-            - 2.0 * P[:, 0, 1] * d[:, 0] * d[:, 1]
-            + P[:, 0, 0] * d[:, 1] * d[:, 1]
-        ) / determinant
-        agree = chi2 <= limit
-        if agree.sum() > best.sum():
-            best = agree
-    return best
-
-
-def _relative(P: Float[np.ndarray, "m m"], i: int, j: int) -> Float[np.ndarray, "n 2 2"]:
-    n = len(P) // 2
-    grid = P.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)
-    own = grid[np.arange(n), np.arange(n)]
-    middle = 0.25 * (grid[i, i] + grid[i, j] + grid[j, i] + grid[j, j])
-    cross = 0.5 * (grid[:, i] + grid[:, j])
-    found: Float[np.ndarray, "n 2 2"] = own + middle - cross - cross.transpose(0, 2, 1)
-    return found
-
-
-def _turned(P: Float[np.ndarray, "n 2 2"], s: float, c: float) -> Float[np.ndarray, "n 2 2"]:
-    xx, xy, yy = P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]
-    across = 2.0 * c * s * xy
-    x, y = c * c * xx - across + s * s * yy, s * s * xx + across + c * c * yy
-    between = c * s * (xx - yy) + (c * c - s * s) * xy
-    found: Float[np.ndarray, "n 2 2"] = np.stack([x, between, between, y], axis=1).reshape(-1, 2, 2)
-    return found
-
-
-def _disagreements(
-    a: Float[np.ndarray, "n 2"],
-    A: Float[np.ndarray, "m m"],
-    b: Float[np.ndarray, "n 2"],
-    B: Float[np.ndarray, "m m"],
-    agree: Bool[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
-    """Compute each landmark's χ² of two degrees of freedom against those that agree.
-
-    With d = a − (R b + t) at the motion of the agreeing landmarks I, their covariance D and
-    Jacobian J by the motion of covariance N: in I by the module's equation; any other k is
-    predicted as D_kI D_II⁻¹ d_I.
-    """
-    n, inside = len(a), np.repeat(agree, 2)
-    of = np.ix_(inside, inside)
-    x, y, turn = align(a[agree], A[of], b[agree], B[of]).a_from_b
-    s, c = core.sin_and_cos(turn)
-    R = np.array([[c, -s], [s, c]])
-    turned = dense.product(b, R.T)
-    d = (a - turned - [x, y]).ravel()
-    T = np.kron(np.eye(n), R)
-    D = A + dense.product(dense.product(T, B), T.T)
-    J = np.zeros((2 * n, 3))
-    J[0::2, 0] = J[1::2, 1] = 1.0
-    J[0::2, 2], J[1::2, 2] = -turned[:, 1], turned[:, 0]
-    W = information(D[of], "the shared landmarks of two maps")
-    gain = dense.product(D[:, inside], W)
-    along = dense.product(W, J[inside])
-    N = information(dense.product(J[inside].T, along), "the motion between two maps")
-    M = W - dense.product(dense.product(along, N), along.T)
-    g = dense.product(W, d[inside])
-    G = J - dense.product(gain, J[inside])
-    e = d - dense.product(gain, d[inside])
-    S = D - dense.product(gain, D[inside]) + dense.product(dense.product(G, N), G.T)
-    found = np.empty(n)
-    place = np.cumsum(agree) - 1
-    for k in range(n):
-        at = 2 * int(place[k]) if agree[k] else 2 * k
-        block, own = (M, g) if agree[k] else (S, e)
-        two = slice(at, at + 2)
-        metric = information(0.5 * (block[two, two] + block[two, two].T), "a difference")
-        found[k] = float(dense.product(dense.product(own[two], metric), own[two]))
-    return found
