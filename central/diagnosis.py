@@ -201,7 +201,7 @@ def cuts_of(fold: Fold, spoilt: Spoilt = NO_SPOILT) -> Iterator[m.Diagnosis]:
     for cut in fold.cuts:
         later = part_of(cut.stream, cut.after)
         island = fold.island(*cut.stream)
-        place = island.state[island.graph.offset[island.graph.streams[cut.stream][-1]] :][:2]
+        place = island.value(island.graph.streams[cut.stream][-1])
         by: tuple[float, ...] = ()
         sigma: tuple[float, ...] = ()
         if fold.home.get(later, later) == fold.home[cut.stream]:
@@ -244,7 +244,7 @@ def _motion_over(submaps: Sequence[Contribution]) -> tuple[Pose, Covariance]:
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         F = np.eye(3)
         F[0, 2], F[1, 2] = pose[1] - after[1], after[0] - pose[0]
-        P = dense.product(dense.product(F, P), F.T) + dense.product(dense.product(R, Q), R.T)
+        P = dense.congruent(F, P) + dense.congruent(R, Q)
         pose = after
     return pose, P
 
@@ -254,7 +254,7 @@ def _chi2(gap: Pose, spread: Covariance) -> float:
         metric = information(spread, "a seam")
     except NotACovarianceError:
         return math.inf
-    return float(dense.product(dense.product(gap, metric), gap))
+    return dense.quadratic(metric, gap)
 
 
 def _is_start(found: hypotheses.Hypothesis | m.Diagnosis) -> bool:

@@ -77,8 +77,8 @@ def fix_warnings(fold: Fold) -> Iterator[str]:
 
 def _residual(island: Island, fix: Encounter, weight: float, around: tuple[int, int]) -> _Residual:
     seen = fix.sighting
-    before, after = (_pose(island, island.graph.poses[seen.stream, each]) for each in around)
-    body = inverse(_pose(island, fix.teammate))
+    before, after = (island.value(island.graph.poses[seen.stream, each]) for each in around)
+    body = inverse(island.value(fix.teammate))
     lasting_s = 1e-9 * (around[1] - around[0])
     v = (transformed(body, after[:2]) - transformed(body, before[:2])) / lasting_s
     distance, bearing = seen.measurement.tolist()
@@ -86,11 +86,6 @@ def _residual(island: Island, fix: Encounter, weight: float, around: tuple[int, 
     P = seen.covariance
     variance = 0.5 * (float(P[0, 0]) + core.squared(distance) * float(P[1, 1]))
     return _Residual(e, v, weight / variance)
-
-
-def _pose(island: Island, node: int) -> Float[np.ndarray, "3"]:
-    begin = island.graph.offset[node]
-    return island.state[begin : begin + 3]
 
 
 def _explained(stream: Stream, residuals: Sequence[_Residual]) -> Iterator[str]:

@@ -253,8 +253,7 @@ def _judge_former_places(
     moved: Mapping[int, m.LandmarkChange],
 ) -> Iterator[m.LandmarkChange]:
     """List the landmarks that are gone, and unnamed ones new beside a former place."""
-    at = island.graph.offset[[*former.values()]].astype(np.intp)
-    places = [points_of(island, unseen), np.column_stack([island.state[at], island.state[at + 1]])]
+    places = [points_of(island, unseen), island.points([*former.values()])]
     for id_, absence in zip(
         [*unseen, *former], absences(island, np.concatenate(places)), strict=True
     ):

@@ -36,8 +36,7 @@ def absences(island: Island, points: Float[np.ndarray, "n 2"]) -> list[Absence]:
     nodes = sorted({node for each in submaps for node in each.landmarks.tolist()})
     if not nodes:
         return [Absence(0.0, 1.0)] * len(points)
-    at = island.graph.offset[nodes]
-    own = np.column_stack([island.state[at], island.state[at + 1]])
+    own = island.points(nodes)
     paths = [path_of(island, each) for each in submaps]
     away = np.array([distances(path, own) for path in paths])
     seen = np.array([np.isin(nodes, each.landmarks) for each in submaps])
@@ -79,8 +78,7 @@ def path_of(island: Island, submap: Joined) -> Float[np.ndarray, "K 2"]:
     """Sample points [m] of a submap's path."""
     poses = len(submap.contribution.local.node_stamps)
     start, end, *between = submap.nodes[: 2 + poses].tolist()
-    at = island.graph.offset[[start, *between, end]]
-    corners = np.column_stack([island.state[at], island.state[at + 1]])
+    corners = island.points([start, *between, end])
     share = (np.arange(STEPS) / STEPS)[:, None]
     parts: Sequence[Float[np.ndarray, "_ 2"]] = [a + share * (b - a) for a, b in pairwise(corners)]
     return np.concatenate([*parts, corners[-1:]])

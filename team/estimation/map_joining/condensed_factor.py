@@ -183,7 +183,7 @@ class Condensed:
             nodes,
             old.at[first],
             old.headings[first],
-            dense.product(dense.product(T.T, old.information), T),
+            dense.congruent(T.T, old.information),
             dense.product(T.T, old.slope + half),
             old.cost + float(dense.product(2.0 * old.slope + half, moved)),
         )

@@ -250,7 +250,7 @@ def _paths(
     paths = dict(before.paths)
     for stream, count in counts.items():
         nodes = graph.streams[stream][:count]
-        poses = np.array([island.state[graph.offset[n] : graph.offset[n] + 3] for n in nodes])
+        poses = np.array([*map(island.value, nodes)])
         old = paths.get(stream, EliminatedPath((), bool(graph.fixed[nodes[0]])))
         paths[stream] = old.longer(poses)
     return paths

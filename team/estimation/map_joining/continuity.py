@@ -116,7 +116,7 @@ def _seen(submap: Joined, scans: slice) -> Indices:
 
 
 def _place(island: Island, submap: Joined, share: float) -> Float[np.ndarray, "2"]:
-    start, end = (island.state[island.graph.offset[node] :][:2] for node in submap.nodes[:2])
+    start, end = island.points(submap.nodes[:2])
     return np.asarray((1.0 - share) * start + share * end)
 
 

@@ -13,11 +13,11 @@ from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
-    ages,
+    empty_island,
+    extend_island,
     joint_marginal,
     solve_island,
 )
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool
 
@@ -45,5 +45,4 @@ def join_robustly(whole: WholeMap, submaps: Sequence[LocalMap], gate: float) -> 
 def _solve(whole: WholeMap, submaps: Sequence[LocalMap], settings: JoinSettings) -> Island:
     chain = [LocalMap(whole.ids, whole.mean, whole.covariance), *submaps]
     taken = [Contribution(*STREAM, k, k, each) for k, each in enumerate(chain)]
-    graph, state = add_submaps(EMPTY_GRAPH, np.zeros(0), taken, {}, {})
-    return solve_island(Island(graph, state, ages(len(taken)), ages(0), settings))[0]
+    return solve_island(extend_island(empty_island(settings), taken, {}))[0]

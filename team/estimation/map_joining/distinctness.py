@@ -248,9 +248,8 @@ def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
     unnamed = sorted(id_ for id_ in ids if id_ >= UNNAMED)
     if not 2 * LEAST_PAIRS <= len(unnamed) <= MOST_POINTS:
         return []
-    node_of, offset = island.graph.landmarks, island.graph.offset
-    points = np.array([island.state[offset[node_of[i]] :][:2] for i in unnamed])
-    sees = _tabulate(island, [node_of[i] for i in unnamed])
+    nodes = [island.graph.landmarks[i] for i in unnamed]
+    points, sees = island.points(nodes), _tabulate(island, nodes)
     streams = [each.contribution.stream for each in island.graph.submaps]
     found = []
     for stream in sorted(island.graph.streams):
@@ -289,7 +288,7 @@ def _find_in_stream(
         vote, radius = found
         submap = island.graph.submaps[rows[k]].contribution
         start = island.graph.submaps[rows[k]].nodes[0]
-        place = island.state[island.graph.offset[start] :][:2]
+        place = island.value(start)[:2]
         there = apply_motion(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
         gone = there - place
         if math.hypot(*gone.tolist()) < FARTHER * radius:

@@ -21,9 +21,17 @@ from teamslam.team.association import DEFAULT_PROFILE, AssociationProfile
 from teamslam.team.config import Bias
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Key, Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE, NotDeterminedError
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.submap_graph import CommonBias, Graph, encounter_of
+from teamslam.team.estimation.map_joining.submap_graph import (
+    EMPTY_GRAPH,
+    NO_NUMBERS,
+    CommonBias,
+    Graph,
+    add_submaps,
+    encounter_of,
+)
 from teamslam.team.shapes import Float, Int64
 
 Values = Float[np.ndarray, " _"]
@@ -210,6 +218,31 @@ class Island:
         """Covariance entries in the layout of the graph's pattern; fixed nodes: identity."""
         with self.determined():
             return self.estimate.selected_covariance
+
+
+def empty_island(settings: JoinSettings) -> Island:
+    """Make an island without submaps."""
+    return Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings)
+
+
+def extend_island(
+    island: Island,
+    contributions: Sequence[Contribution],
+    starts: Mapping[Stream, InitialPoseFactor],
+    numbers: Mapping[Key, Sequence[int]] = NO_NUMBERS,
+) -> Island:
+    """Add submaps to an island, in order (`add_submaps`)."""
+    graph, state = add_submaps(
+        island.graph,
+        island.state,
+        contributions,
+        starts,
+        island.settings.bias_sigma,
+        island.settings.common_bias_sigma,
+        numbers,
+    )
+    age = np.concatenate([island.age, ages(len(contributions))])
+    return replace(island, graph=graph, state=state, age=age)
 
 
 def age_factors(island: Island, iterations: int | None) -> Island:

@@ -259,11 +259,10 @@ def _begin_ns(island: Island, place: int) -> int:
 
 
 def _is_misread(base: _Solved, id_: int, own: Sights, second: Bool[np.ndarray, " n"]) -> bool:
-    graph, state = base.island.graph, base.island.state
-    gate = base.scale * LANDMARK_GATE
+    island, gate = base.island, base.scale * LANDMARK_GATE
     return any(
-        float(np.median(_chi2_about(own, state[graph.offset[node] :][:2], second))) < gate
-        for other, node in graph.landmarks.items()
+        float(np.median(_chi2_about(own, island.value(node), second))) < gate
+        for other, node in island.graph.landmarks.items()
         if other != id_ and other < UNNAMED
     )
 
@@ -292,8 +291,7 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         own, node = sights[id_], graph.landmarks[id_]
         late = set(own.places[second].tolist())
         trial = split(base.island, node, late, _centre(own, second))
-        span = slice(int(graph.offset[node]), int(graph.offset[node]) + 2)
-        trial.state[span] = _centre(own, ~second)
+        trial.value(node)[:] = _centre(own, ~second)
         found = resolved(trial)
         if found is None:
             continue
@@ -335,8 +333,7 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         start, end = int(joined.nodes[0]), int(joined.nodes[1])
         robot, stamp = joined.contribution.robot, joined.contribution.end_ns
         own = joined.contribution.local
-        begin = island.state[graph.offset[start] : graph.offset[start] + 3]
-        finish = island.state[graph.offset[end] : graph.offset[end] + 3]
+        begin, finish = island.value(start), island.value(end)
         back = compose(finish, inverse(own.end_pose))
         new = len(graph.fixed)
         before = _begin_ns(island, at)
@@ -395,8 +392,7 @@ def motion_beyond(
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     jump = mean[3:] - predicted
     jump[2:] = wrapped(jump[2:])
-    spread = dense.product(dense.product(J, P), J.T)
-    return jump, spread + dense.product(dense.product(R, covariance), R.T)
+    return jump, dense.congruent(J, P) + dense.congruent(R, covariance)
 
 
 def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
@@ -427,8 +423,7 @@ def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
     if found is None:
         return
     solved, cost = found
-    here = solved.state[graph.offset[node] : graph.offset[node] + 2]
-    away = own.points[np.isin(own.places, spoilt)] - here
+    away = own.points[np.isin(own.places, spoilt)] - solved.value(node)
     farthest = away[int(np.argmax(core.hypot(away[:, 0], away[:, 1])))]
     sigma = np.sqrt(np.diagonal(graph.pattern.block(island.selected_covariance, node, node)))
     yield Hypothesis(

@@ -42,7 +42,8 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
     add_sightings,
-    ages,
+    empty_island,
+    extend_island,
     final_cost,
     is_solvable,
     is_suspicious,
@@ -70,18 +71,14 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     reunite,
     separate,
 )
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 
 __all__ = [
     "EMPTY_FOLD",
     "Contribution",
     "Fold",
-    "GapError",
     "InitialPoseFactor",
     "InterRobotFactor",
     "JoinSettings",
-    "LateStartError",
-    "NotCanonicalError",
     "Stream",
     "Tick",
     "add_start",
@@ -95,40 +92,6 @@ __all__ = [
 
 NAMED = 10  # most robots named in the record of a merge
 PATIENCE = 1.1  # growth in submaps after which a failed search is repeated
-
-
-class NotCanonicalError(ValueError):
-    """A submap is out of the canonical order."""
-
-    def __init__(self, contribution: Contribution) -> None:
-        super().__init__(
-            f"submap {contribution.sequence} of {named(contribution.stream)} comes out of order; "
-            "sort by (end stamp, robot, incarnation, sequence), for a late one fold again from "
-            "before it"
-        )
-        self.contribution = contribution
-
-
-class GapError(ValueError):
-    """Submaps of a stream are missing before this one."""
-
-    def __init__(self, contribution: Contribution, expected: int) -> None:
-        super().__init__(
-            f"{named(contribution.stream)}: submap {contribution.sequence} came, {expected} is next"
-        )
-        self.contribution = contribution
-        self.expected = expected
-
-
-class LateStartError(ValueError):
-    """An initial pose was given for a stream with folded submaps."""
-
-    def __init__(self, start: InitialPoseFactor) -> None:
-        super().__init__(
-            f"the start of {named(start.stream)} comes after its first submap; "
-            "fold again with the start known from the beginning"
-        )
-        self.start = start
 
 
 @dataclass(frozen=True)
@@ -266,9 +229,12 @@ EMPTY_FOLD = Fold((), {}, {}, {}, {})
 
 
 def add_start(fold: Fold, start: InitialPoseFactor) -> Fold:
-    """Add a stream's initial pose, before its submaps."""
+    """Add a stream's initial pose; raises ValueError after its submaps."""
     if start.stream in fold.home:
-        raise LateStartError(start)
+        raise ValueError(
+            f"the start of {named(start.stream)} comes after its first submap; "
+            "fold again with the start known from the beginning"
+        )
     return replace(fold, starts={**fold.starts, start.stream: start})
 
 
@@ -280,9 +246,9 @@ def fold_submaps(
 ) -> Fold:
     """Fold one tick: add the submaps, place new landmarks, iterate, and merge islands if possible.
 
-    contributions: in canonical order, after all folded ones; else raises NotCanonicalError or
-    GapError. sightings: from these submaps, each a factor once both of its nodes are in one island.
-    Islands without new submaps keep their state.
+    contributions: in canonical order without gaps, after all folded ones; else raises ValueError.
+    sightings: from these submaps, each a factor once both of its nodes are in one island. Islands
+    without new submaps keep their state.
     """
     _check_order(fold, contributions)
     home = dict(fold.home)
@@ -302,18 +268,10 @@ def fold_submaps(
         seen = {id_ for each in contributions for id_ in each.local.ids.tolist()}
         islands = {key: wake_landmarks(island, seen) for key, island in islands.items()}
     for key, taken in arrived.items():
-        island = islands.get(key, Island(EMPTY_GRAPH, np.zeros(0), ages(0), ages(0), settings))
-        graph, state = add_submaps(
-            island.graph,
-            island.state,
-            taken,
-            fold.starts,
-            settings.bias_sigma,
-            settings.common_bias_sigma,
-            numbers,
+        island = extend_island(
+            islands.get(key) or empty_island(settings), taken, fold.starts, numbers
         )
-        age = np.concatenate([island.age, ages(len(taken))])
-        island, waiting = add_sightings(replace(island, graph=graph, state=state, age=age), waiting)
+        island, waiting = add_sightings(island, waiting)
         islands[key] = iterate_tick(island)
     grown = replace(
         fold,
@@ -423,14 +381,19 @@ def _search_island(island: Island) -> Search:
 def _check_order(fold: Fold, contributions: Sequence[Contribution]) -> None:
     for before, after in pairwise((*fold.contributions[-1:], *contributions)):
         if not before.key < after.key:
-            raise NotCanonicalError(after)
+            raise ValueError(
+                f"submap {after.sequence} of {named(after.stream)} comes out of order; sort by "
+                "(end stamp, robot, incarnation, sequence), for a late one fold again from before "
+                "it"
+            )
     expected: dict[Stream, int] = {}
-    for contribution in contributions:
-        stream = contribution.stream
-        sequence = expected.get(stream, fold.next_sequence(stream))
-        if contribution.sequence != sequence:
-            raise GapError(contribution, sequence)
-        expected[stream] = sequence + 1
+    for each in contributions:
+        sequence = expected.get(each.stream, fold.next_sequence(each.stream))
+        if each.sequence != sequence:
+            raise ValueError(
+                f"{named(each.stream)}: submap {each.sequence} came, {sequence} is next"
+            )
+        expected[each.stream] = sequence + 1
 
 
 def _merge_all(fold: Fold, at_last: bool = False) -> Fold:

@@ -114,8 +114,7 @@ def _sights_of(island: Island) -> _Sights:
         own = place[each.landmarks[local.ids >= UNNAMED]]
         row[own[own >= 0]] = True
         np.add.at(counts, own[own >= 0], local.unnamed.counts[own >= 0].astype(np.int64))
-    at = graph.offset[nodes]
-    points = np.column_stack([island.state[at], island.state[at + 1]])
+    points = island.points(nodes)
     away = np.array([distances(path_of(island, each), points) for each in submaps])
     return _Sights(submaps, nodes, points, sees, counts, away.reshape(sees.shape))
 
@@ -162,8 +161,7 @@ def _uncertainty_of(
     spread = np.zeros(sights.away.shape)
     blocks = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     for row, pair in zip(spread, ends, strict=True):
-        places = np.add.outer(graph.offset[pair], np.arange(2))
-        offsets = points[:, None] - island.state[places][None]
+        offsets = points[:, None] - island.points(pair)
         nearer = (offsets * offsets).sum(axis=2).argmin(axis=1)
         end = np.add.outer(first[np.searchsorted(union, pair)], np.arange(2))[nearer]
         away = offsets[np.arange(n), nearer]

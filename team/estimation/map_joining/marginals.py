@@ -254,7 +254,7 @@ def prior_for(
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
     """Return the end pose of the stream's last submap, in its island's frame."""
     island = fold.islands[fold.home[stream]]
-    return _mean(island, island.graph.streams[stream][-1])
+    return island.value(island.graph.streams[stream][-1])
 
 
 def main_priors(
@@ -275,7 +275,7 @@ def main_priors(
     places = points_of(island, ids.tolist())
     nearest = {}
     for stream in streams:
-        offsets = places - _mean(island, island.graph.streams[stream][-1])[:2]
+        offsets = places - island.value(island.graph.streams[stream][-1])[:2]
         order = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
         nearest[stream] = sorted(ids[order[:most]].tolist())
     return _priors_in(island, nearest)
@@ -463,16 +463,12 @@ def joint_cost(fold: Fold) -> Agreement:
     )
 
 
-def _mean(island: Island, node: int) -> Float[np.ndarray, " k"]:
-    return island.state[island.graph.offset[node] : island.graph.offset[node + 1]]
-
-
 def _own_marginal(
     island: Island, node: int
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
     block = island.graph.pattern.block(island.selected_covariance, node, node)
     fixed = bool(island.graph.fixed[node])
-    return _mean(island, node), np.zeros_like(block) if fixed else block
+    return island.value(node), np.zeros_like(block) if fixed else block
 
 
 def _sighting_costs(island: Island) -> list[SightingCost]:

@@ -98,18 +98,13 @@ def understated_uncertainty(island: Island, node: int) -> UnderstatedUncertainty
     # a bend; to first order η = A (dx, dy, dθ), whatever the distance to the frame's origin.
     s, c = core.sin_and_cos(mean[2])
     A = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    metric = information(dense.product(dense.product(A, covariance), A.T), "a pose")
-    at = int(island.graph.offset[node])
+    metric = information(dense.congruent(A, covariance), "a pose")
     found = []
     for walked, rise in profile(island, node):
-        pose = walked.state[at : at + 3]
+        pose = walked.value(node)
         eta = logarithm(compose(inverse(mean), pose))
         distance = core.hypot(*(pose - mean)[:2])
-        found.append(
-            UnderstatedUncertainty(
-                distance, rise, float(dense.product(dense.product(eta, metric), eta))
-            )
-        )
+        found.append(UnderstatedUncertainty(distance, rise, dense.quadratic(metric, eta)))
     worst = max(found, key=lambda each: each.ratio, default=None)
     return None if worst is None or worst.ratio < BENT else worst
 

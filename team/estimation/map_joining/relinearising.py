@@ -13,21 +13,23 @@ import numpy as np
 from teamslam.team.estimation.contribution import Contribution, Key, Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.inter_robot import InterRobotFactor
+from teamslam.team.estimation.map_joining.auditing import cut_members
 from teamslam.team.estimation.map_joining.condensed_factor import EliminatedPath
 from teamslam.team.estimation.map_joining.condensing import LIMITS
-from teamslam.team.estimation.map_joining.cutting import cut_members
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,
     Island,
     add_sightings,
-    ages,
+    age_factors,
+    empty_island,
+    extend_island,
     is_solvable,
     iterate_tick,
 )
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known, points_of
 from teamslam.team.estimation.map_joining.saved_maps import maps_of, separate
-from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, NO_NUMBERS, add_submaps
+from teamslam.team.estimation.map_joining.submap_graph import NO_NUMBERS
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.shapes import Float
 
@@ -126,35 +128,26 @@ def _raw(
     paths: Mapping[Stream, EliminatedPath],
     numbers: Mapping[Key, Sequence[int]],
 ) -> Island:
-    graph, settings = island.graph, island.settings
-    full, state = add_submaps(
-        EMPTY_GRAPH,
-        np.zeros(0),
-        contributions,
-        fold.starts,
-        settings.bias_sigma,
-        settings.common_bias_sigma,
-        numbers,
-    )
-    state, fixed = state.copy(), full.fixed.copy()
+    graph = island.graph
+    raw = extend_island(empty_island(island.settings), contributions, fold.starts, numbers)
+    raw = age_factors(raw, FULL_AGE)
+    full, state, fixed = raw.graph, raw.state.copy(), raw.graph.fixed.copy()
+    raw = replace(raw, graph=replace(full, fixed=fixed), state=state)
 
     def put(node: int, value: Values) -> None:
         state[full.offset[node] : full.offset[node + 1]] = value
 
-    def value(node: int) -> Values:
-        return island.state[graph.offset[node] : graph.offset[node + 1]]
-
     for stream, nodes in graph.streams.items():
         left = paths.get(stream, EliminatedPath((), bool(graph.fixed[nodes[0]])))
         fixed[full.streams[stream][0]] = left.is_fixed
-        path = [*left.poses, *(value(node) for node in nodes)]
+        path = [*left.poses, *map(island.value, nodes)]
         for node, pose in zip(full.streams[stream], path, strict=True):
             put(node, pose)
     ids = known(island)
     given_up = {full.landmarks[id_] for id_ in full.landmarks.keys() - set(ids)}
     for submap in full.submaps:
         local, members = submap.contribution.local, submap.nodes
-        start = state[full.offset[members[0]] : full.offset[members[0]] + 3]
+        start = raw.value(members[0])
         for at, pose in zip(members[2:].tolist(), local.nodes, strict=False):
             put(at, compose(start, pose))
         for at, point in zip(submap.landmarks.tolist(), local.landmarks, strict=True):
@@ -166,9 +159,7 @@ def _raw(
     pairs += [(full.common[bias], node) for bias, node in graph.common.items()]
     pairs += [(full.remembered[of], node) for of, node in graph.remembered.items()]
     for node, own in pairs:
-        put(node, value(own))
-    age = np.full(len(full.submaps), FULL_AGE)
-    raw = Island(replace(full, fixed=fixed), state, age, ages(0), settings)
+        put(node, island.value(own))
     for saved in maps_of(full):
         of = saved.contribution.stream
         raw = separate(raw, saved, (id_ for stream, id_ in graph.former if stream == of))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import compress
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from teamslam.team.shapes import Bool, Float, Int64
 
 Indices = Int64[np.ndarray, " _"]
 Values = Float[np.ndarray, " _"]
+K = TypeVar("K")
 
 
 CommonBias = Bias | Literal["marker"]
@@ -279,35 +280,23 @@ class Graph:
 
     def name(self, node: int) -> str:
         """Name a node in messages."""
-        for stream, nodes in self.streams.items():
-            if node == nodes[0]:
-                return f"the start of {named(stream)}"
-            if node in nodes:
-                sequence = self.first_sequence(stream) + nodes.index(node) - 1
-                return f"the end of submap {sequence} of {named(stream)}"
-        for (stream, stamp_ns), at in self.poses.items():
-            if node == at:
-                return f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
-        for (stream, id_), at in self.former.items():
-            if node == at:
-                return f"the place of landmark {id_} in {named(stream)}"
-        return self._name_of_error(node) or self._name_of_landmark(node)
-
-    def _name_of_error(self, node: int) -> str:
-        for (stream, bias), at in self.biases.items():
-            if node == at:
-                return f"the bias {bias} of {named(stream)}"
-        for (stream, (robot, bias)), at in self.remembered.items():
-            if node == at:
-                return f"the bias {bias} of {robot} in {named(stream)}"
+        names = {at: f"landmark {id_}" for id_, at in self.landmarks.items()}
         for error, at in self.common.items():
-            if node == at:
-                return f"the {'marker' if isinstance(error, int) else 'bias'} {error} of the team"
-        return ""
-
-    def _name_of_landmark(self, node: int) -> str:
-        ids = [id_ for id_, at in self.landmarks.items() if at == node]
-        return f"landmark {ids[0]}" if ids else "a split node"
+            kind = "marker" if isinstance(error, int) else "bias"
+            names[at] = f"the {kind} {error} of the team"
+        for (stream, (robot, bias)), at in self.remembered.items():
+            names[at] = f"the bias {bias} of {robot} in {named(stream)}"
+        for (stream, bias), at in self.biases.items():
+            names[at] = f"the bias {bias} of {named(stream)}"
+        for (stream, id_), at in self.former.items():
+            names[at] = f"the place of landmark {id_} in {named(stream)}"
+        for (stream, stamp_ns), at in self.poses.items():
+            names[at] = f"the pose of {named(stream)} at {stamp_ns * 1e-9:g} s"
+        for stream, (start, *ends) in self.streams.items():
+            names[start] = f"the start of {named(stream)}"
+            for sequence, at in enumerate(ends, self.first_sequence(stream)):
+                names[at] = f"the end of submap {sequence} of {named(stream)}"
+        return names.get(node, "a split node")
 
 
 EMPTY_GRAPH = Graph(
@@ -328,32 +317,76 @@ def _starts(lengths: Sequence[int]) -> Indices:
 
 
 class _Growth:
-    """Nodes being added by `add_submaps`."""
+    """A graph that is being extended: new nodes come after all others."""
 
-    def __init__(self, graph: Graph, state: Values) -> None:
+    def __init__(self, graph: Graph, state: Values, bias_sigma: Mapping[Bias, float]) -> None:
+        self.graph, self.state, self.bias_sigma = graph, state, bias_sigma
         self.streams = dict(graph.streams)
         self.landmarks = dict(graph.landmarks)
         self.poses = dict(graph.poses)
         self.biases = dict(graph.biases)
         self.common = dict(graph.common)
         self.remembered = dict(graph.remembered)
-        self.offset = graph.offset
-        self.state = state
-        self.count = len(graph.fixed)
+        self.submaps = list(graph.submaps)
+        self.priors = list(graph.priors)
         self.values: list[Values] = []
         self.fixed: list[bool] = []
 
     def value(self, node: int, size: int) -> Values:
-        before = len(self.offset) - 1
+        before = len(self.graph.fixed)
         if node >= before:
             return self.values[node - before]
-        return self.state[self.offset[node] : self.offset[node] + size]
+        return self.state[self.graph.offset[node] : self.graph.offset[node] + size]
 
-    def add(self, value: Values, fixed: bool) -> int:
+    def add(self, value: Values, *, fixed: bool = False) -> int:
         self.values.append(value)
         self.fixed.append(fixed)
-        self.count += 1
-        return self.count - 1
+        return len(self.graph.fixed) + len(self.values) - 1
+
+    def add_stream(self, stream: Stream, start: InitialPoseFactor | None) -> None:
+        start = InitialPoseFactor(*stream, np.zeros(3)) if start is None else start
+        node = self.add(start.pose, fixed=start.covariance is None)
+        self.streams[stream] = (node,)
+        if start.information is not None:
+            self.priors.append(Prior((node,), start.pose, start.information, 3))
+
+    def add_error(
+        self, among: dict[K, int], error: K, sigma: float, *, is_of_robot: bool = False
+    ) -> int:
+        """Return the node of an error that submaps share, with its prior where it is new."""
+        if error not in among:
+            among[error] = self.add(np.zeros(1))
+            self.priors.append(Prior.of_bias(among[error], sigma, is_of_robot=is_of_robot))
+        return among[error]
+
+    def add_remembered(self, contribution: Contribution) -> list[int]:
+        """Add the errors of single robots in a saved map, with their evidence."""
+        own, stream = contribution.own, contribution.stream
+        nodes = [self.add(mean[None]) for mean in own.mean]
+        for error, node in zip(own.errors, nodes, strict=True):
+            self.remembered[stream, error] = node
+            sigma = self.bias_sigma[error.bias]
+            self.priors.append(Prior.of_bias(node, sigma, is_of_robot=True))
+        biases = contribution.local.biases
+        shared = [self.common[b] if b in self.common else self.biases[stream, b] for b in biases]
+        both = (*shared, *nodes)
+        self.priors.append(Prior(both, own.likeliest, own.evidence, len(both)))
+        return nodes
+
+    def grown(self) -> tuple[Graph, Values]:
+        grown, state, _ = append_nodes(self.graph, self.state, self.values, self.fixed)
+        grown = replace(
+            grown,
+            streams=self.streams,
+            landmarks=self.landmarks,
+            poses=self.poses,
+            biases=self.biases,
+            submaps=tuple(self.submaps),
+            priors=tuple(self.priors),
+            common=self.common,
+            remembered=self.remembered,
+        )
+        return _tie_biases(grown), state
 
 
 def add_submaps(
@@ -372,92 +405,37 @@ def add_submaps(
     bias has scale bias_sigma about 0 (without one the submap's biases are dropped), a common error
     is N(0, common_bias_sigma²). numbers: the team's, of unnamed landmarks.
     """
-    growth = _Growth(graph, state)
-    priors = list(graph.priors)
-    submaps = list(graph.submaps)
+    growth = _Growth(graph, state, bias_sigma)
     for contribution in (_drop_unscaled_biases(each, bias_sigma) for each in contributions):
         stream, local = contribution.stream, contribution.local
         if stream not in growth.streams:
-            start = starts.get(stream, InitialPoseFactor(*stream, np.zeros(3)))
-            node = growth.add(start.pose, start.covariance is None)
-            growth.streams[stream] = (node,)
-            if start.information is not None:
-                priors.append(Prior((node,), start.pose, start.information, 3))
+            growth.add_stream(stream, starts.get(stream))
         start_node = growth.streams[stream][-1]
         map_from_start = growth.value(start_node, 3)
-        end_node = growth.add(compose(map_from_start, local.end_pose), fixed=False)
+        end_node = growth.add(compose(map_from_start, local.end_pose))
         growth.streams[stream] = (*growth.streams[stream], end_node)
-        poses = [growth.add(compose(map_from_start, node), fixed=False) for node in local.nodes]
+        poses = [growth.add(compose(map_from_start, node)) for node in local.nodes]
         for stamp_ns, node in zip(local.node_stamps.tolist(), poses, strict=True):
             growth.poses[stream, stamp_ns] = node
         ids = numbers.get(contribution.key) or local.ids.tolist()
         for id_, point in zip(ids, local.landmarks, strict=True):
             if id_ not in growth.landmarks:
-                growth.landmarks[id_] = growth.add(transformed(map_from_start, point), fixed=False)
+                growth.landmarks[id_] = growth.add(transformed(map_from_start, point))
         seen = [growth.landmarks[id_] for id_ in ids]
         common = _common_errors(contribution, common_bias_sigma)
         own = local.biases
         if is_map(stream):
             own = tuple(bias for bias in own if bias not in common)
-        priors += _add_errors(growth, stream, own, bias_sigma, common)
-        errors: list[int] = []
+        errors = [
+            growth.add_error(growth.biases, (stream, bias), bias_sigma[bias], is_of_robot=True)
+            for bias in own
+        ]
+        errors += [growth.add_error(growth.common, *each) for each in common.items()]
         if contribution.own.errors:
-            errors, known = _remember(growth, contribution, bias_sigma)
-            priors += known
-        errors += [growth.biases[stream, bias] for bias in own]
-        errors += [growth.common[error] for error in common]
+            errors = growth.add_remembered(contribution) + errors
         nodes = np.array([start_node, end_node, *poses, *seen, *errors])
-        submaps.append(Joined.of(contribution, nodes, own, tuple(common)))
-    grown, state, _ = append_nodes(graph, state, growth.values, growth.fixed)
-    grown = replace(
-        grown,
-        streams=growth.streams,
-        landmarks=growth.landmarks,
-        poses=growth.poses,
-        biases=growth.biases,
-        submaps=tuple(submaps),
-        priors=tuple(priors),
-        common=growth.common,
-        remembered=growth.remembered,
-    )
-    return _tie_biases(grown), state
-
-
-def _add_errors(
-    growth: _Growth,
-    stream: Stream,
-    own: Sequence[Bias],
-    bias_sigma: Mapping[Bias, float],
-    common: Mapping[CommonError, float],
-) -> list[Prior]:
-    priors = []
-    for bias in own:
-        if (stream, bias) not in growth.biases:
-            node = growth.biases[stream, bias] = growth.add(np.zeros(1), fixed=False)
-            priors.append(Prior.of_bias(node, bias_sigma[bias], is_of_robot=True))
-    for error, sigma in common.items():
-        if error not in growth.common:
-            node = growth.common[error] = growth.add(np.zeros(1), fixed=False)
-            priors.append(Prior.of_bias(node, sigma))
-    return priors
-
-
-def _remember(
-    growth: _Growth, contribution: Contribution, bias_sigma: Mapping[Bias, float]
-) -> tuple[list[int], list[Prior]]:
-    own, stream = contribution.own, contribution.stream
-    nodes = [growth.add(mean[None], fixed=False) for mean in own.mean]
-    growth.remembered |= {
-        (stream, error): node for error, node in zip(own.errors, nodes, strict=True)
-    }
-    biases = contribution.local.biases
-    shared = [growth.common[b] if b in growth.common else growth.biases[stream, b] for b in biases]
-    both = (*shared, *nodes)
-    priors = [
-        Prior.of_bias(node, bias_sigma[error.bias], is_of_robot=True)
-        for error, node in zip(own.errors, nodes, strict=True)
-    ]
-    return nodes, [*priors, Prior(both, own.likeliest, own.evidence, len(both))]
+        growth.submaps.append(Joined.of(contribution, nodes, own, tuple(common)))
+    return growth.grown()
 
 
 def _tie_biases(graph: Graph) -> Graph:
@@ -523,17 +501,14 @@ def remove_nodes(
     condensed one.
     """
     node_of = np.where(eliminated, -1, np.cumsum(~eliminated) - 1)
-    streams, gone, out = {}, dict(graph.gone), eliminated.tolist()
+    streams, gone = {}, dict(graph.gone)
     for stream, nodes in graph.streams.items():
-        first = sum(out[node] for node in nodes)
+        first = int(eliminated[[*nodes]].sum())
         streams[stream] = nodes[first:]
         gone[stream] = graph.first_sequence(stream) + first
     left = replace(
         graph,
         streams=streams,
-        landmarks={id_: node for id_, node in graph.landmarks.items() if not out[node]},
-        poses={at: node for at, node in graph.poses.items() if not out[node]},
-        former={at: node for at, node in graph.former.items() if not out[node]},
         submaps=tuple(compress(graph.submaps, submaps)),
         sightings=tuple(compress(graph.sightings, sightings)),
         priors=tuple(compress(graph.priors, priors)),
@@ -546,18 +521,23 @@ def remove_nodes(
 def _renumber_nodes(graph: Graph, node_of: Indices, stays: Bool[np.ndarray, " _"]) -> Graph:
     """Renumber the nodes of a graph, except in condensed factors.
 
-    node_of: new number of each node. stays: origins of the new nodes, ascending.
+    node_of: new number of each node, −1 for a dropped one. stays: origins of the new nodes,
+    ascending.
     """
     new = node_of.tolist()
+
+    def renamed(nodes: Mapping[K, int]) -> dict[K, int]:
+        return {key: new[node] for key, node in nodes.items() if new[node] >= 0}
+
     return replace(
         graph,
         streams={s: tuple(new[node] for node in nodes) for s, nodes in graph.streams.items()},
-        landmarks={number: new[node] for number, node in graph.landmarks.items()},
-        poses={key: new[node] for key, node in graph.poses.items()},
-        former={key: new[node] for key, node in graph.former.items()},
-        biases={key: new[node] for key, node in graph.biases.items()},
-        common={bias: new[node] for bias, node in graph.common.items()},
-        remembered={of: new[node] for of, node in graph.remembered.items()},
+        landmarks=renamed(graph.landmarks),
+        poses=renamed(graph.poses),
+        former=renamed(graph.former),
+        biases=renamed(graph.biases),
+        common=renamed(graph.common),
+        remembered=renamed(graph.remembered),
         offset=_starts(np.diff(graph.offset)[stays].tolist()),
         fixed=graph.fixed[stays],
         submaps=tuple(each._replace(nodes=node_of[each.nodes]) for each in graph.submaps),
@@ -645,24 +625,18 @@ def merge_graphs(
     The other frame's gauge becomes free, so none of its submaps may be condensed.
     """
     assert other.condensed is None, "a condensed factor is linearised in its own frame"
-    common = {
-        node: main.landmarks[id_] for id_, node in other.landmarks.items() if id_ in main.landmarks
-    }
-    common |= {
-        node: main.common[bias] for bias, node in other.common.items() if bias in main.common
-    }
-    node_of = np.empty(len(other.fixed), dtype=np.int64)
-    values: list[Values] = []
-    for node in range(len(other.fixed)):
-        if node in common:
-            node_of[node] = common[node]
-            continue
-        node_of[node] = len(main.fixed) + len(values)
-        value = other_state[other.offset[node] : other.offset[node + 1]]
-        values.append(_transform_value(main_from_other, value))
+    node_of = np.full(len(other.fixed), -1)
+    for id_ in main.landmarks.keys() & other.landmarks.keys():
+        node_of[other.landmarks[id_]] = main.landmarks[id_]
+    for bias in main.common.keys() & other.common.keys():
+        node_of[other.common[bias]] = main.common[bias]
+    moves = node_of < 0
+    node_of[moves] = len(main.fixed) + np.arange(moves.sum())
+    parts = np.split(other_state, other.offset[1:-1])
+    values = [_transform_value(main_from_other, each) for each in compress(parts, moves)]
     moved = _renumber_nodes(other, node_of, np.ones(len(other.fixed), np.bool_))
     kept = [
-        not prior.is_of_pose and (len(prior.nodes) > 1 or prior.nodes[0] not in common)
+        not prior.is_of_pose and (len(prior.nodes) > 1 or moves[prior.nodes[0]])
         for prior in other.priors
     ]
     grown, joint, _ = append_nodes(main, state, values)
