@@ -288,7 +288,7 @@ def _find_in_stream(
         vote, radius = found
         submap = island.graph.submaps[rows[k]].contribution
         start = island.graph.submaps[rows[k]].nodes[0]
-        place = island.value(start)[:2]
+        place = island.value(int(start))[:2]
         there = apply_motion(vote.motion, (place - points[fresh].mean(axis=0))[None])[0]
         gone = there - place
         if math.hypot(*gone.tolist()) < FARTHER * radius:

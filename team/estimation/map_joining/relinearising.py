@@ -147,7 +147,7 @@ def _raw(
     given_up = {full.landmarks[id_] for id_ in full.landmarks.keys() - set(ids)}
     for submap in full.submaps:
         local, members = submap.contribution.local, submap.nodes
-        start = raw.value(members[0])
+        start = raw.value(int(members[0]))
         for at, pose in zip(members[2:].tolist(), local.nodes, strict=False):
             put(at, compose(start, pose))
         for at, point in zip(submap.landmarks.tolist(), local.landmarks, strict=True):

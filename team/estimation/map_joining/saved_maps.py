@@ -189,7 +189,7 @@ def separate(island: Island, saved: Joined, ids: Iterable[int]) -> Island:
     stream = saved.contribution.stream
     nodes = {node: k for k, node in enumerate(saved.landmarks.tolist())}
     by_others = _observed_by_others(graph, saved)
-    start = island.value(saved.nodes[0])
+    start = island.value(int(saved.nodes[0]))
     for id_ in sorted(ids):
         node = graph.landmarks[id_]
         value = transformed(start, saved.contribution.local.landmarks[nodes[node]])
