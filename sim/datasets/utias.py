@@ -56,12 +56,6 @@ ERRATA: Mapping[str, _Erratum] = {
 }
 
 
-def _erratum_of(
-    barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarray, "L 5"]
-) -> _Erratum | None:
-    return ERRATA.get(content_digest(barcodes, landmarks))
-
-
 ROBOTS = 5  # subjects 1 … 5 are robots, even without files; landmarks follow
 
 BARCODES = ("subject", "barcode")
@@ -96,7 +90,7 @@ def _streams(
     survey = optional_table(files, "Landmark_Groundtruth.dat", SURVEY)
     subject_of = _subjects(barcodes)
     notes = []
-    erratum = _erratum_of(barcodes, survey) if world.errata else None
+    erratum = ERRATA.get(content_digest(barcodes, survey)) if world.errata else None
     if erratum:
         notes.append(erratum.note)
         swap = erratum.subjects
@@ -175,9 +169,10 @@ def _stream(robot: str, read: _Reading) -> RobotStream:
             ("Odometry", ODOMETRY), ("Measurement", MEASUREMENT), ("Groundtruth", TRUTH),
         )
     )  # fmt: skip
-    intervals, odometry_notes = _intervals_of(odometry, read.delay_ns + read.clocks[robot])
-    seen, measurement_notes = _measurements_of(measured, read.subject_of)
-    truth_ns, truth, truth_notes = _truth_of(true_rows)
+    notes: list[str] = []
+    intervals = _intervals_of(odometry, read.delay_ns + read.clocks[robot], notes)
+    seen = _measurements_of(measured, read.subject_of, notes)
+    truth_ns, truth = _truth_of(true_rows, notes)
     missing = (
         "no odometry: only its observations are used" if not len(intervals.end_ns) else "",
         "no measurements: only its odometry is given" if not len(seen.stamps_ns) else "",
@@ -185,14 +180,13 @@ def _stream(robot: str, read: _Reading) -> RobotStream:
     )
     if missing[0] and missing[1]:
         raise DatasetError(f"robot {robot}: neither odometry nor measurements in its files")
-    notes = [*filter(None, missing), *odometry_notes, *measurement_notes, *truth_notes]
+    notes = [*filter(None, missing), *notes]
     start_ns = int(
         np.concatenate((intervals.end_ns[:1] - intervals.duration_ns[:1], seen.stamps_ns[:1])).min()
     )
 
     def keep(chosen: Bool[np.ndarray, " R"], otherwise: str) -> Scans:
-        note = count_note(int(np.count_nonzero(~chosen)), "measurement", f"dropped: {otherwise}")
-        notes.extend([note] if note else [])
+        _count(notes, ~chosen, "measurement", f"dropped: {otherwise}")
         return seen.where(chosen)
 
     if len(intervals.end_ns):
@@ -247,38 +241,28 @@ def nanoseconds(seconds: Float[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
     return np.rint(seconds * 1e6).astype(np.int64) * 1000
 
 
-def _intervals_of(
-    rows: Float[np.ndarray, "N 3"], delay_ns: int
-) -> tuple[Intervals, tuple[str, ...]]:
+def _intervals_of(rows: Float[np.ndarray, "N 3"], delay_ns: int, notes: list[str]) -> Intervals:
     """Convert odometry rows (t, v, ω): row k acts over [t_k, t_{k+1}] + delay."""
-    rows, backward = _sort_by_time(rows)
+    rows = _sort_by_time(rows, "odometry row", notes)
     stamps = nanoseconds(rows[:, 0]) + delay_ns
     duration = np.diff(stamps)
     lasting = duration > 0
-    intervals = Intervals(
+    _count(notes, ~lasting, "odometry row", "dropped: another row has the same time")
+    if np.any(duration > LONG_GAP_NS):
+        seconds = duration.max() * 1e-9
+        notes.append(f"odometry has a gap of {seconds:.1f} s: its last velocities hold over it")
+    return Intervals(
         end_ns=stamps[1:][lasting],
         duration_ns=duration[lasting],
         forward=rows[:-1, 1][lasting],
         yaw_rate=rows[:-1, 2][lasting],
     )
-    notes = [
-        count_note(backward, "odometry row", "earlier than the row before: sorted by time"),
-        count_note(
-            int(np.count_nonzero(~lasting)),
-            "odometry row",
-            "dropped: another row has the same time",
-        ),
-    ]
-    if np.any(duration > LONG_GAP_NS):
-        seconds = duration.max() * 1e-9
-        notes.append(f"odometry has a gap of {seconds:.1f} s: its last velocities hold over it")
-    return intervals, tuple(filter(None, notes))
 
 
 def _measurements_of(
-    rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int]
-) -> tuple[Scans, tuple[str, ...]]:
-    rows, backward = _sort_by_time(rows)
+    rows: Float[np.ndarray, "N 4"], subject_of: Mapping[int, int], notes: list[str]
+) -> Scans:
+    rows = _sort_by_time(rows, "measurement", notes)
     codes = np.array(sorted(subject_of), dtype=np.float64)
     subjects = np.array([subject_of[int(code)] for code in codes], dtype=np.uint32)
     at = np.minimum(np.searchsorted(codes, rows[:, 1]), len(codes) - 1)
@@ -289,34 +273,25 @@ def _measurements_of(
     )
     usable = known & positive
     single = first_of_each(measurements.stamps_ns, measurements.ids, usable)
-    notes = (
-        count_note(backward, "measurement", "earlier than the row before: sorted by time"),
-        count_note(int(np.count_nonzero(~known)), "measurement", "dropped: unknown barcode"),
-        count_note(
-            int(np.count_nonzero(known & ~positive)), "measurement", "dropped: range not above 0"
-        ),
-        count_note(
-            int(np.count_nonzero(usable & ~single)),
-            "measurement",
-            "dropped: a second one of the same subject at the same time",
-        ),
-    )
-    return measurements.where(single), tuple(filter(None, notes))
+    for dropped, reason in (
+        (~known, "unknown barcode"),
+        (known & ~positive, "range not above 0"),
+        (usable & ~single, "a second one of the same subject at the same time"),
+    ):
+        _count(notes, dropped, "measurement", f"dropped: {reason}")
+    return measurements.where(single)
 
 
 def _truth_of(
-    rows: Float[np.ndarray, "N 4"],
-) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"], tuple[str, ...]]:
+    rows: Float[np.ndarray, "N 4"], notes: list[str]
+) -> tuple[Int64[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
     """Rows (t, x, y, θ) by time."""
-    rows, backward = _sort_by_time(rows)
+    rows = _sort_by_time(rows, "ground truth row", notes)
     stamps = nanoseconds(rows[:, 0])
-    notes = [
-        count_note(backward, "ground truth row", "earlier than the row before: sorted by time")
-    ]
     gaps = np.diff(stamps)
     if np.any(gaps > LONG_GAP_NS):
         notes.append(f"ground truth has gaps, the longest of {gaps.max() * 1e-9:.1f} s")
-    return stamps, rows[:, 1:].copy(), tuple(filter(None, notes))
+    return stamps, rows[:, 1:].copy()
 
 
 def _start_pose(
@@ -343,10 +318,17 @@ def _start_pose(
     return np.array([at[0], at[1], on_circle(np.array(at[2] + poses[middle, 2])).item()])
 
 
-def _sort_by_time(rows: Float[np.ndarray, "N C"]) -> tuple[Float[np.ndarray, "N C"], int]:
-    """Stably sorted rows, and the number of backward steps."""
-    backward = int(np.count_nonzero(np.diff(rows[:, 0]) < 0.0))
-    return (rows[np.argsort(rows[:, 0], kind="stable")] if backward else rows), backward
+def _sort_by_time(
+    rows: Float[np.ndarray, "N C"], thing: str, notes: list[str]
+) -> Float[np.ndarray, "N C"]:
+    backward = np.diff(rows[:, 0]) < 0.0
+    _count(notes, backward, thing, "earlier than the row before: sorted by time")
+    return rows[np.argsort(rows[:, 0], kind="stable")] if backward.any() else rows
+
+
+def _count(notes: list[str], chosen: Bool[np.ndarray, " _"], thing: str, what: str) -> None:
+    if chosen.any():
+        notes.append(count_note(int(np.count_nonzero(chosen)), thing, what))
 
 
 Row = tuple[str | float, ...]

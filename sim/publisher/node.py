@@ -67,9 +67,8 @@ class Configurations:
 
     @property
     def forbid(self) -> bool:
-        """Whether a node announced only wrong configurations.
-
-        If both arrived, another process uses the name: a warning.
+        """Whether a node announced only wrong configurations: of both kinds, another process uses
+        its name.
         """
         return bool(self._mismatches.keys() & self._expected.keys() - self._right)
 
@@ -103,10 +102,9 @@ RESUME_S = 2.0  # wait [s] of a restarted world for all progress reports
 class WorldNode:
     """Publish the world: call `begin`, `publish` until `ended`, and `handle` for each message.
 
-    expected: nodes that must be alive first. speed: team seconds per clock second; infinite:
-    limited by credit. cache: last measurements of a robot that can be requested again; an older
-    request begins a new incarnation. tells_map: publish true landmarks. batch_s: most team time
-    between checks for messages. peers: robots whose final maps are awaited.
+    expected: nodes that must be alive first. speed: team seconds per clock second. cache: last
+    measurements of a robot that can be requested; an older request begins a new incarnation.
+    batch_s: most team time between checks for messages. peers: robots whose final maps are awaited.
     """
 
     streams: WorldStreams
@@ -236,9 +234,7 @@ class WorldNode:
         return []
 
     def _finish(self) -> None:
-        """End once an expected centre and every peer have final maps; peers do not need an absent
-        centre.
-        """
+        """End once an expected centre and all peers have final maps; peers need no absent centre."""
         conclusions = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
         agreed = (
             len(conclusions) == len(self.peers) and len({each.digest for each in conclusions}) <= 1
@@ -248,9 +244,7 @@ class WorldNode:
         self.finished = self.finished or (agreed and central)
 
     def _note_too_far(self, progress: m.Progress, source: Source) -> None:
-        """Treat progress beyond the published measurements as complete: else a node that took a
-        stranger's messages would hold the world for ever.
-        """
+        """Treat impossible progress as complete, so that its node does not hold the world."""
         if progress.node == "recorder":
             stream = (progress.robot, progress.incarnation)
             self._recorded[stream] = max(self._recorded.get(stream, 0), source.counter)
@@ -277,8 +271,7 @@ class WorldNode:
     def _going_on(self, clock_s: float) -> bool:
         """Whether an earlier process began the world, and all progress is known.
 
-        This process continues from the least progress, in the same incarnations; receivers drop
-        repetitions.
+        This process continues from the least progress; receivers drop repetitions.
         """
         if not self._consumed:
             return False

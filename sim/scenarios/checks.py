@@ -27,9 +27,9 @@ class ScenarioError(ValueError):
 
 
 def check_fields(value: object, declared: Any, at: str) -> None:
-    """Refuse unknown fields, wrong choices and non-finite numbers.
+    """Refuse unknown fields, wrong choices and non-finite numbers of a value of a declared type.
 
-    declared: type of `value`; `at`: its path in the file. msgspec checks types and bounds.
+    at: path in the file. msgspec checks types and bounds.
     """
     if get_origin(declared) is Annotated:
         declared = get_args(declared)[0]
@@ -93,7 +93,7 @@ def close(name: object, known: Iterable[str]) -> str:
 def plain_error(error: msgspec.ValidationError, at: str = "", of: object = None) -> ScenarioError:
     """Convert "Expected `float`, got `str` - at `$.a.b`" to "expected float, got str at a.b".
 
-    of: the converted fields; a number out of its bounds is named: "expected float > 0 at a.b: 0".
+    of: the converted fields, which give the value: "expected float > 0 at a.b: 0".
     """
     problem, _, path = str(error).partition(" - at `")
     field = path.rstrip("`").removeprefix("$").lstrip(".")
@@ -108,7 +108,7 @@ def plain_error(error: msgspec.ValidationError, at: str = "", of: object = None)
 
 
 def _value_at(path: str, of: object) -> object:
-    """Value at a path such as `$.robots[0].id` of nested fields; None if there is none."""
+    """Value at a path such as `$.robots[0].id`, or None."""
     if "[...]" in path:  # of a key that the path does not state
         return None
     for name, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):

@@ -1,4 +1,4 @@
-"""Convert a user's TOML document (docs/scenario.md) to the plain fields of a resolved scenario."""
+"""Convert a user's TOML document (docs/scenario.md) to the plain fields of a scenario."""
 
 import re
 import tomllib
@@ -41,9 +41,8 @@ def builtin_text(name: str) -> str:
 
 
 def named_document(name: str) -> tuple[Fields, str]:
-    """Merged document of a built-in scenario or user file, and its short name.
-
-    A data set's `scenario.toml` is named after its folder or zip.
+    """Merged document of a built-in scenario or user file, and its short name: a data set's folder
+    or zip.
     """
     if name in builtin_names():
         return _builtin(name), name
@@ -64,10 +63,8 @@ def _short_name(text: str) -> str:
 
 
 def own_document(name: str) -> Fields:
-    """Unmerged document of a user's file.
-
-    The data set's path becomes relative to the working directory; a file in a zip describes that
-    zip.
+    """Unmerged document of a user's file; the data set's path becomes relative to the working
+    directory.
     """
     archive, path = _file_at(Path(name))
     if path.is_dir():
@@ -102,9 +99,9 @@ def _file_at(path: Path) -> "tuple[Path | None, Path | zipfile.Path]":
 
 
 def resolve(document: Fields, stem: str, known: Sequence[str]) -> Fields:
-    """Merge defaults into every robot and add names; `known`: fields of a scenario.
+    """Merge defaults into every robot and add names; values are checked where the user wrote them.
 
-    Values are checked where the user wrote them.
+    known: fields of a scenario.
     """
     for name in document:
         check_known(name, [*known, "base", "defaults", "robot_count"], "")

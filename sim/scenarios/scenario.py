@@ -111,8 +111,8 @@ def with_options(
 ) -> Scenario:
     """Apply command-line changes; None leaves a field; raises ScenarioError.
 
-    robots: number; further ones repeat the scenario's in turn, with new ids, or those of the data
-    set's folder.
+    robots: number; further ones repeat the scenario's, with new ids or those of the data set's
+    folder.
     """
     fields: Fields = msgspec.to_builtins(scenario)
     changes = {"seed": seed, "estimator": estimator, "fusion": fusion}
@@ -180,7 +180,7 @@ def _world_of(scenario: Scenario, path: str) -> Fields:
 
 
 def _kind_of(path: str, otherwise: str) -> str:
-    """Kind of a data set; `otherwise` if undetermined: reading it reports the fault."""
+    """Kind of a data set, or `otherwise`: reading it reports the fault."""
     from teamslam.sim.datasets.kinds import kind_of
     from teamslam.sim.datasets.tables import DatasetError
 
@@ -233,7 +233,6 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
 
 
 def _fit_count(robots: Sequence[Fields], count: int, names: Sequence[str]) -> list[Fields]:
-    """The first robots, and further ones by names of the data set, else r1, r2, …"""
     checked_count(count)
     taken = {robot.get("id") for robot in robots}
     numbered = (f"r{i}" for i in range(1, 2 * MAX_ROBOTS + 1))
@@ -374,13 +373,13 @@ def _which(kind: object) -> str:
 
 
 def data_set_scenario(scenario: Scenario) -> str:
-    """Same robots and centre, for the UTIAS set in this text's folder; robots are r1, r2, …"""
+    """Text with the same robots, as r1, r2, …, and centre for a UTIAS set in its folder."""
     ids = [f"r{i}" for i in range(1, len(scenario.robots) + 1)]
     return _text(scenario, ids, {"kind": "utias"} | _chosen(UtiasWorld(path="."), UtiasWorld, ()))
 
 
 def folder_scenario(scenario: Scenario) -> str:
-    """Same robots and centre, for the tables in this text's folder."""
+    """Text with the same robots and centre for tables in its folder."""
     ids = [robot.id for robot in scenario.robots]
     unknown = [robot for robot in ids if starts_unknown(scenario.world, robot)]
     world: dict[str, Any] = {"kind": "folder", "path": "."}

@@ -85,10 +85,7 @@ def open_data_set(path: str | Path) -> tuple[WorldStreams, Scenario, str | None]
 
 
 def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
-    """Remove robots without files; also return a note on them.
-
-    If none has files all stay: reading the data set reports the fault.
-    """
+    """Remove robots without files, with a note; all stay if none has files."""
     world = scenario.world
     if not isinstance(world, FolderWorld | UtiasWorld) or not world.path:
         return scenario, None
@@ -120,6 +117,6 @@ def tells_map(scenario: Scenario, streams: WorldStreams) -> bool:
 
 
 def _noise_seed(scenario: Scenario) -> int:
-    """Key of random numbers, from scenario name and seed: a positive 63-bit integer."""
+    """Positive 63-bit seed from scenario name and seed."""
     text = f"{scenario.name}/{scenario.seed}".encode()
     return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1

@@ -25,8 +25,7 @@ class _World(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 class SimulatedWorld(_World, frozen=True, tag="simulated"):
     """Square of side size_m with point landmarks; robots drive in steps of step_s seconds.
 
-    visible_from_m and visible_to_m limit the *true* range: a gate on noisy measurements selects by
-    noise and biases the map.
+    visible_from_m and visible_to_m limit the *true* range: a gate on measurements biases the map.
     """
 
     steps: Annotated[int, Meta(ge=1, le=1_000_000)]
@@ -104,14 +103,11 @@ class _DataSet(_World, frozen=True):
 
 
 class FolderWorld(_DataSet, frozen=True, tag="folder"):
-    """Data set in a folder (or zip) of CSV tables, one sub-folder per robot."""
+    """Data set in a folder or zip of CSV tables."""
 
 
 class LiveWorld(_World, frozen=True, tag="live"):
-    """No world: drivers publish measurements and end streams.
-
-    newcomer: configuration of unnamed robots.
-    """
+    """Drivers publish measurements and end streams; newcomer: configuration of unnamed robots."""
 
     admit: bool = False
     newcomer: RobotConfig | None = None
@@ -146,7 +142,7 @@ def starts_unknown(world: World, robot: str) -> bool:
 
 
 class RadioWindow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Robots that reach each other in [from_s, to_s] of team time since the beginning."""
+    """Robots that reach each other in [from_s, to_s] of team time."""
 
     robots: tuple[str, ...]
     from_s: NonNegative

@@ -20,9 +20,9 @@ from teamslam.team.shapes import Float, UInt32
 
 @dataclass(frozen=True)
 class Hiding:
-    """tagged: share of landmarks that keep identities. missed: probability that a detection is
-    omitted. clutter: share of false detections, uniform in the disc of radius reach_m, or of the
-    farthest detection.
+    """tagged: share of landmarks with identities. missed: probability of an omitted detection.
+    clutter: share of false detections, uniform in the disc of radius reach_m, or of the farthest
+    detection.
     """
 
     tagged: float = 0.0
@@ -107,10 +107,7 @@ def _add_clutter(seen: Detections, hiding: Hiding, rng: np.random.Generator) -> 
 
 
 def in_order(parts: Sequence[Detections]) -> Detections:
-    """Merge messages by time, those with identities first.
-
-    Columns of only some parts are NaN elsewhere.
-    """
+    """Merge messages by time, those with identities first; NaN in columns of other parts."""
     if len(parts) == 1:
         return parts[0]
     parts = [part for part in parts if len(part.ids)] or parts[:1]

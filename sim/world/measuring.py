@@ -32,10 +32,7 @@ def visible_points(
     farthest: float,
     field_of_view: float,
 ) -> Visible:
-    """Points with true range in [nearest, farthest] and true bearing in the field of view.
-
-    points: P positions, constant or K × P.
-    """
+    """Points (P, constant or K × P) with true range in [nearest, farthest] in the field of view."""
     dx = points[..., 0] - poses[:, :1]
     dy = points[..., 1] - poses[:, 1:2]
     ranges = core.hypot(dx, dy)
@@ -51,9 +48,8 @@ def persistent_errors(
 ) -> Float[np.ndarray, "V 2"]:
     """Errors of unit variance, partly correlated over time for each point.
 
-    n = √white w + √(1 − white) g with white w and g of a first-order Gauss-Markov process: g(t + τ)
-    = ρ g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: two columns of w and two of n',
-    range first.
+    n = √white w + √(1 − white) g with white w and a first-order Gauss-Markov process g(t + τ) = ρ
+    g(t) + √(1 − ρ²) n', ρ = exp(−τ/correlation time). normals: two columns of w, two of n'.
     """
     constant = normals[:, 2:].copy()
     times = np.array([sensor.range_correlation_s, sensor.bearing_correlation_s])
@@ -79,9 +75,9 @@ def measurements(
 ) -> tuple[Float[np.ndarray, " V"], Float[np.ndarray, " V"]]:
     """Measured ranges [m] and bearings [rad], from errors n of unit variance.
 
-    range = range_scale · (r + σ(r) n₁) + range_offset with σ(r)² = range_sigma² +
-    (range_sigma_per_m r)²; bearing = raw + bearing_sigma n₂ with raw = b + bearing_offset +
-    lens(raw). With range_is_depth r + σ(r) n₁ is projected on the optical axis.
+    range = range_scale · (r + σ(r) n₁) + range_offset, σ(r)² = range_sigma² + (range_sigma_per_m
+    r)²; bearing = raw + bearing_sigma n₂, raw = b + bearing_offset + lens(raw). With range_is_depth
+    r + σ(r) n₁ is projected on the optical axis.
     """
     raw = seen.bearings + sensor.bearing_offset
     lens = sensor.bearing_lens
@@ -115,9 +111,8 @@ def add_outliers(
 ) -> Detections:
     """Replace a share of the measurements by outliers, from uniform numbers in [0, 1).
 
-    The first number of a row selects. "measurement": the others are a range in `span` [m] and a
-    bearing in the field of view. "identity": the second selects another landmark 1 … `landmarks`.
-    "drop": omitted.
+    The first number selects the row. "measurement": the others are a range in `span` [m] and a
+    bearing. "identity": the second selects another landmark. "drop": omitted.
     """
     chosen = uniforms[:, 0] < share
     if kind == "drop":
@@ -147,7 +142,7 @@ Column = Float[np.ndarray, " K"]
 
 
 def _deviation(noise: MotionNoise, seconds: Column, steps: Float[np.ndarray, "K 2"]) -> Column:
-    """σ = √(per_s² t + per_m² |distance| + per_rad² |rotation|) of one noise in each step."""
+    """σ = √(per_s² t + per_m² |distance| + per_rad² |rotation|) of each step."""
     distance, turn = np.abs(steps).T
     per_s, per_m, per_rad = noise.per_s, noise.per_m, noise.per_rad
     variance = per_s**2 * seconds + per_m**2 * distance + per_rad**2 * turn
@@ -164,9 +159,9 @@ def measured_speeds(
 ) -> tuple[Column, Column]:
     """Measured forward speed [m/s] and yaw rate [rad/s].
 
-    Forward and turn noise are added to translation d and rotation φ; wheel noise to each wheel's
-    path. The noisy d and φ give ω and v by φ = ω t + veer·d and |d| = (|v| − turn_drag·|ω|)·t; they
-    are divided by the scales.
+    Forward and turn noise are added to translation d and rotation φ, wheel noise to each wheel's
+    path; ω and v follow from φ = ω t + veer·d and |d| = (|v| − turn_drag·|ω|)·t, divided by the
+    scales.
     """
     of_way, of_turn, _ = _interval_deviations(motion, steps, seconds)
     forward = core.hypot(_deviation(motion.forward, seconds, steps), of_way)
@@ -207,8 +202,8 @@ def _interval_deviations(
 ) -> tuple[Column, Column, Column]:
     """σ of translation, rotation and final rotation by Ma & Ma's α.
 
-    Errors of v, ω, γ are constant over an interval T, in which the translation errs by ε T with var
-    ε = α₁v² + α₂ω². A step of t has t/T such intervals: var = (α₁v² + α₂ω²) T² t/T.
+    Errors of v, ω, γ are constant over an interval T: a step of t has t/T of them, so var = (α₁v² +
+    α₂ω²) T² t/T.
     """
     if motion.alphas is None:
         return (np.zeros(len(steps)),) * 3
@@ -224,10 +219,7 @@ def _interval_deviations(
 def _of_the_way(
     motion: MotionModel, steps: Float[np.ndarray, "K 2"], seconds: Column
 ) -> tuple[Column, Column, Column]:
-    """σ of forward, lateral and heading errors proportional to the path, constant over a time T.
-
-    A step of t has t/T such intervals: σ² = (share · path in T)² t/T.
-    """
+    """σ of forward, lateral and heading errors, constant over T: σ² = (share · path in T)² t/T."""
     assert motion.shares is not None
     in_interval = np.abs(steps[:, 0]) / seconds * motion.shares_interval_s
     count = np.sqrt(seconds / motion.shares_interval_s)
@@ -241,7 +233,7 @@ def _wheel_errors(
     steps: Float[np.ndarray, "K 2"],
     normals: Float[np.ndarray, "K 2"],
 ) -> tuple[Column, Column]:
-    """Errors [m] of the left and right wheel's path: σ = noise √|path| of each wheel."""
+    """Errors [m] of the left and right wheel's path: σ = noise √|path|."""
     distance, turn = steps.T
     left, right = distance - 0.5 * base * turn, distance + 0.5 * base * turn
     return (
@@ -281,8 +273,8 @@ def measured_increments(
 
         true motion = measured motion ∘ Exp(f, l, φ)
 
-    with a constant twist in the frame of the measured end; f, l and φ have the deviations of the
-    model's forward, lateral and turn; l and φ are correlated.
+    in the frame of the measured end, with the deviations of the model's forward, lateral and turn;
+    l and φ are correlated.
     """
     before, after = poses[:-1], poses[1:]
     true_turn = after[:, 2] - before[:, 2]
@@ -307,9 +299,8 @@ def measured_increments(
 def measured_steering(
     motion: MotionModel, forward: Column, yaw_rate: Column
 ) -> tuple[Column, Column]:
-    """Wheel speed [m/s] and steering angle [rad] of a car.
-
-    The base turns about a point forward/yaw_rate to its left, on the line of the rear axle.
+    """Wheel speed [m/s] and steering angle [rad] of a car, which turns about a point
+    forward/yaw_rate to the left of its rear axle.
     """
     assert motion.wheel_base is not None
     moving = np.abs(forward) > 1e-9

@@ -1,7 +1,4 @@
-"""True motion of simulated robots.
-
-A step is (distance [m], rotation [rad]); poses (x, y, θ) are in the world frame.
-"""
+"""True motion of simulated robots: steps (distance [m], rotation [rad]) and poses (x, y, θ)."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,8 +29,8 @@ class Drive:
 class Limits:
     """Limits of a step, and the distance at which a way-point is reached.
 
-    turn_first: a rotating step has no translation. radius: smallest turning radius [m]; 0 turns on
-    the spot.
+    turn_first: a rotating step has no translation. radius: least turning radius [m]; 0: on the
+    spot.
     """
 
     distance: float
@@ -50,10 +47,7 @@ def wrapped(angle: float) -> float:
 
 
 def follow_way_points(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
-    """Follow a polyline in steps of equal arc length: rotate, then drive.
-
-    A step across a corner is its chord.
-    """
+    """Follow a polyline in steps of equal arc length, with chords at corners: rotate, then drive."""
     legs = hypot(*np.diff(way_points, axis=0).T)
     arc = np.concatenate(([0.0], np.cumsum(legs)))
     at = np.linspace(0.0, arc[-1], steps + 1)
@@ -98,8 +92,8 @@ def move_pose(
 ) -> Pose:
     """Pose after a step, a left slip and a final rotation.
 
-    turn-then-drive: rotation, then straight. Others: the arc, whose chord has length distance ·
-    sin(φ/2)/(φ/2) and direction θ + φ/2.
+    turn-then-drive: rotation, then straight. Others: an arc of chord distance · sin(φ/2)/(φ/2) in
+    direction θ + φ/2.
     """
     x, y, heading = pose
     distance, turn = step

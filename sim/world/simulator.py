@@ -1,7 +1,7 @@
 """Simulated world: true paths, noisy odometry, measurements of landmarks and teammates.
 
-Motion and sensor are implemented independently of the estimator, so an error in either half shows.
-Random streams are keyed by (seed, robot, purpose).
+Motion and sensor are independent of the estimator's, so an error in either half shows. Random
+streams are keyed by (seed, robot, purpose).
 """
 
 import hashlib
@@ -57,7 +57,7 @@ def simulate(world: SimulatedWorld, robots: Sequence[RobotConfig], seed: int) ->
 
     Robot i follows path i; without a path, or with slip or arc motion, it steers to way-points.
     Each step ends with one, possibly empty, landmark message, and one of teammates if any is seen.
-    With a late odometry clock, team time starts later, so no stamp is negative.
+    With a late odometry clock, team time starts later: no stamp is negative.
     """
     landmarks = _landmarks(world, seed)
     ids = np.arange(1, len(landmarks) + 1, dtype=np.uint32)

@@ -1,8 +1,8 @@
 """Streams of a world: each robot's measurements in order, and the truth.
 
 One counter spans a robot's measurements in the order (stamp, kind); measurement 0 is the initial
-pose. Odometry intervals are contiguous and stamped with their *end*: at equal stamps the
-measurements at the end of an interval come before it.
+pose. Odometry intervals are contiguous and stamped with their *end*, behind measurements of that
+time.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,9 +31,9 @@ class StartPose:
 class Intervals:
     """Odometry: end stamp, length, mean forward speed [m/s] and yaw rate [rad/s].
 
-    steered: a car's wheel speed [m/s] and steering angle [rad] instead. increments: motions
-    instead, poses (x, y, theta) of the end in the frame of the start; speeds are then zero.
-    covariances: of the increments, in the frame of the end. NaN: absent.
+    steered: wheel speed [m/s] and steering angle [rad] instead. increments: poses (x, y, theta) of
+    the end in the frame of the start instead; speeds are then zero. covariances: in the frame of
+    the end. NaN: absent.
     """
 
     end_ns: Int64[np.ndarray, " I"]
@@ -81,9 +81,9 @@ class Detections:
 
     ids: landmarks, or indices of teammates. points: measured (x, y) in the sensor frame [m], NaN
     for a range and bearing. covariances: (rr, rb, bb), or (xx, xy, yy) of points, NaN if absent;
-    rows of a message are alike. hidden: messages published without identities (None: none), whose
-    ids are for scoring, NO_LABEL for clutter. signatures: similar numbers for the same landmark.
-    classes: ln P(reported class | class); both of hidden ones only.
+    alike within a message. hidden: messages published without identities, whose ids are for
+    scoring, NO_LABEL for clutter. Of hidden ones only: signatures, similar for the same landmark,
+    and classes, ln P(reported class | class).
     """
 
     stamps_ns: Int64[np.ndarray, " M"]
@@ -153,11 +153,11 @@ class RobotStream:
     """All measurements of a robot by (stamp, kind), initial pose first; the counter indexes kinds,
     stamps_ns and rows.
 
-    start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth
-    (x, y, θ) in the team's frame at truth_ns. clock_offset_ns: published odometry stamps read this
-    much less. positions: of another sensor, in its own frame, for scoring. fixes: (x, y) [m] in the
-    survey's frame, with covariances (xx, xy, yy) [m²], NaN if not stated. Raises ValueError for a
-    measurement before the initial pose, or non-contiguous odometry.
+    start: at start_ns, None if unknown. rows: row in the arrays of the measurement's kind. truth:
+    (x, y, θ) in the team's frame. clock_offset_ns: published odometry stamps read this much less.
+    positions: of another sensor, in its own frame, for scoring. fixes: (x, y) [m] in the survey's
+    frame with covariances (xx, xy, yy) [m²] or NaN. Raises ValueError for a measurement before the
+    initial pose, or non-contiguous odometry.
     """
 
     robot: str

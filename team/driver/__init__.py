@@ -1,1 +1,1 @@
-"""A robot's driver: passes the robot's measurements on to its team and loses none of them."""
+"""A robot's driver: delivers its measurements to the team and loses none."""

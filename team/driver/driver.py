@@ -1,4 +1,4 @@
-"""The driver delivers a program's measurements to the robot's process.
+"""Deliver a program's measurements to the robot's process.
 
 Each is checked, written to the robot's file and published by a separate thread, so a call never
 waits for the network. Missed measurements are sent from the file.
@@ -52,7 +52,7 @@ _LOG = logging.getLogger("teamslam")
 
 
 class DriverError(RuntimeError):
-    """The driver cannot continue; the text says why and what to do."""
+    """The driver cannot continue; the text has reason and remedy."""
 
 
 class Driver:
@@ -61,9 +61,9 @@ class Driver:
     team: as in the scenario. connect: endpoint of the router. keys: folder with the certificate
     `source-<robot>`. file: of all measurements, default `<robot>.stream`; a driver started again
     with the same file continues its stream. start: (x [m], y [m], theta [rad]) in the team's frame;
-    None: unknown. start_covariance: 3 × 3; None: exactly known. landmarks: all landmark ids, if
-    known. latency_s: longest delay of a detection behind the odometry of its time. patience_s: time
-    to wait for the router with a new file; 0: connect later. bounds: physical limits of the robot;
+    None: unknown. start_covariance: 3 × 3; None: exact. landmarks: all landmark ids, if known.
+    latency_s: longest delay of a detection behind the odometry of its time. patience_s: time to
+    wait for the router with a new file; 0: connect later. bounds: physical limits of the robot;
     without them a yaw rate beyond LIKELY_RAD_S is refused, too. on_message: called in another
     thread with each message of the team for this robot (`PoseEstimate` in the team's frame,
     `FusedMap`, smoothed `Trajectory`, `Status`); it has to return at once. map: file of a saved map
@@ -201,7 +201,7 @@ class Driver:
     ) -> None:
         """Add odometry: the pose at t in the odometry's own frame [m, rad]; differences are used.
 
-        covariance: 3 × 3, of the motion since the last call, in the frame of its end pose.
+        covariance: 3 × 3, of the motion since the last call, in the frame of its end.
         """
         stamp_ns = make.stamp_of(t, "odometry_pose")
         pose = make.pose_of((x, y, theta), f"odometry_pose of {self.robot} at {t} s")
@@ -305,18 +305,18 @@ class Driver:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """The last (t, (x, y, theta)) in the team's frame; None: not joined to the map."""
+        """The last (t, (x, y, theta)) in the team's frame; None: not joined."""
         return self._node.team_pose
 
     @property
     def sensor_mount(self) -> tuple[float, float, float] | None:
-        """The sensor's pose on the robot (x [m], y [m], yaw [rad]); None: not yet announced."""
+        """The sensor's pose (x [m], y [m], yaw [rad]) on the robot; None: not yet announced."""
         models = self._node.models
         return None if models is None else models.sensor.mount
 
     @property
     def antenna(self) -> tuple[float, float] | None:
-        """The GNSS antenna's place on the robot (ahead, left) [m]; None: not yet announced."""
+        """The GNSS antenna's place (ahead, left) [m] on the robot; None: not yet announced."""
         models = self._node.models
         return None if models is None else models.gnss.antenna
 
@@ -407,7 +407,7 @@ class Driver:
         self._odometer.pose = self._journal.pose
 
     def _begin_again(self) -> None:
-        """Begin the empty stream of a later run, at an unknown pose: the robot may have moved."""
+        """Begin the empty stream of a later run at an unknown pose: the robot may have moved."""
         self._continued, self._start = self._journal, (b"", b"")
         self._again, self._incarnation = -1, 0
         self._odometer = Odometer(self.robot, self._bounds)
@@ -518,7 +518,7 @@ class Driver:
     def _drive(
         self, stamp_ns: int, interval: m.AnyOdometry | None, step: Pose, pose: Pose | None = None
     ) -> None:
-        """Append an odometry interval to the file, after one that bridges the gap before it."""
+        """Append an odometry interval, after one that bridges the gap before it."""
         lasts_ns = 0 if interval is None else interval.duration_ns
         begin_ns = stamp_ns - lasts_ns
         gap_ns = self._odometer.gap_ns

@@ -31,11 +31,7 @@ Place = tuple[int, int]
 
 
 class Sorter:
-    """Sort items by their places, with a bounded delay.
-
-    A camera's frame may arrive after the odometry of its time: an item is held until one newer by
-    `latency_ns` has arrived.
-    """
+    """Sort items by their places: each is held until one newer by `latency_ns` has arrived."""
 
     def __init__(self, latency_ns: int) -> None:
         self.latency_ns = latency_ns
@@ -46,7 +42,7 @@ class Sorter:
         """Place of the last returned item; earlier places are closed."""
 
     def put(self, place: Place, item: int) -> list[int]:
-        """Add an item; return the items whose place is now final."""
+        """Add an item; return those whose place is now final."""
         heappush(self._waiting, (place, self._arrived, item))
         self._arrived += 1
         newest_ns = place[0] if self._newest_ns is None else max(self._newest_ns, place[0])
@@ -85,18 +81,17 @@ Start = tuple[bytes, bytes]  # pose and covariance of an `InitialPose`; empty: u
 
 
 class JournalError(RuntimeError):
-    """A driver's file cannot be used; the text names file, reason and remedy."""
+    """A driver's file cannot be used; the text has file, reason and remedy."""
 
 
 @dataclass
 class Journal:
     """One robot's file, open for appending (`open_journal`). Any thread may read.
 
-    incarnation: the one in progress; 0: none. delivered: every receiver has all of it. calls:
-    offsets of all records but marks. driven_ns, pose: end of the last odometry interval, and the
-    odometry pose there. cut: bytes behind the last whole record; is_damaged: they are no incomplete
-    record. clock: the wall clock at the last mark. team: "" in files of earlier versions. run: that
-    receives the stream; "": unknown.
+    incarnation: in progress; 0: none. delivered: every receiver has all of it. calls: offsets of
+    all records but marks. driven_ns, pose: end of the last odometry interval, and the odometry pose
+    there. cut: bytes behind the last whole record; is_damaged: they are no incomplete record.
+    clock: the wall clock at the last mark. team, run: "": unknown.
     """
 
     path: Path
@@ -132,7 +127,7 @@ class Journal:
             return sorted(self._numbered)
 
     def count(self, incarnation: int) -> int:
-        """Return the number of numbered measurements of an incarnation."""
+        """Count the numbered measurements of an incarnation."""
         with self._lock:
             return len(self._numbered.get(incarnation, ()))
 
@@ -155,7 +150,7 @@ class Journal:
         return self._sorter.latency_ns
 
     def too_late(self, stamp_ns: int, kind: int) -> bool:
-        """Return whether a measurement of a later place already has its number."""
+        """Whether a measurement of a later place already has its number."""
         released = self._sorter.released
         return released is not None and (stamp_ns, kind) < released
 
@@ -188,7 +183,7 @@ class Journal:
     ) -> None:
         """Append the stream's state, and number all waiting measurements.
 
-        incarnation: number of the first incarnation of an empty file.
+        incarnation: the first one of an empty file.
         """
         said = {
             "state": state,
@@ -343,7 +338,7 @@ def _why_not_continued(journal: Journal, team: str, start: Start, age_s: float) 
 def replace_journal(
     journal: Journal, why: str, latency_ns: int, team: str, start: Start
 ) -> tuple[Journal, str]:
-    """Rename an open journal's file, and begin an empty one; return it and a description."""
+    """Rename an open journal's file, and begin an empty one, with a description."""
     journal.close()
     _, aside = _aside(journal.path)
     journal.path.rename(aside)
@@ -404,8 +399,8 @@ def _lock_file(path: Path, robot: str) -> Journal:
 
 
 def _head_of(journal: Journal) -> tuple[int, int] | None:
-    """Return the first incarnation in a file's head, and the head's length; None: an empty file, or
-    one with a part of the head and zeros, as after a crash.
+    """Return a file's first incarnation, and the head's length; None: an empty file, or one with a
+    part of the head and zeros, as after a crash.
     """
     begin = os.pread(journal._file, 4096, 0)
     unpacker = msgpack.Unpacker()
@@ -431,7 +426,7 @@ def _head_of(journal: Journal) -> tuple[int, int] | None:
 
 
 def _aside(path: Path) -> tuple[Path | None, Path]:
-    """Return the newest file that was set aside, and the name of the next one."""
+    """Newest file that was set aside, and the name of the next one."""
     newest, number = None, 1
     while (aside := path.with_name(f"{path.name}.{number}")).exists():
         newest, number = aside, number + 1

@@ -90,12 +90,12 @@ class Link:
 
     @property
     def failure(self) -> str | None:
-        """The exception that ended the thread, in words; None: running or closed."""
+        """The exception that ended the thread, in words, or None."""
         failed = self._failure
         return None if failed is None else f"{type(failed).__name__}: {failed}"
 
     def wait(self, timeout_s: float) -> None:
-        """Wait for a change of the node's state, at most this long."""
+        """Wait for a change of the node's state."""
         with self._moved:
             self._moved.wait(timeout_s)
 

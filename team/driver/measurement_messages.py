@@ -21,7 +21,7 @@ LARGEST_SIGMA_RAD = 0.5  # a larger standard deviation of a bearing [rad] is pro
 
 
 class MeasurementError(ValueError):
-    """A value cannot be a measurement, and the call is refused; the text has place and remedy."""
+    """A value cannot be a measurement; the text has place and remedy."""
 
 
 class DriverWarning(UserWarning):
@@ -41,7 +41,7 @@ def stamp_of(t: float | Decimal, what: str) -> int:
 
 
 class Call(NamedTuple):
-    """A call of the driver: a robot's measurement at a time, and its name in errors."""
+    """A robot's measurement at a time, and its name in errors."""
 
     robot: str
     stamp_ns: int

@@ -20,8 +20,8 @@ Pose = tuple[float, float, float]
 class Odometer:
     """State of the odometry: end of the last interval, and the odometry pose there if given.
 
-    speeds: its forward [m/s] and yaw rate [rad/s]; rates: its (ahead, left, turn) per second.
-    gap_ns: time before it without odometry. home: first pose. fastest: highest speed [m/s] so far.
+    speeds: forward [m/s] and yaw rate [rad/s]; rates: (ahead, left, turn) per second. gap_ns: time
+    before it without odometry. home: first pose. fastest: highest speed [m/s].
     """
 
     robot: str
@@ -90,7 +90,7 @@ class Odometer:
             self.speeds = step[0] * 1e9 / duration_ns, step[2] * 1e9 / duration_ns
 
     def was_reset(self, step: Pose, duration_ns: int, pose: Pose) -> bool:
-        """Return whether the odometry jumps to its first pose, or RESET_TIMES as fast as ever."""
+        """Whether the odometry jumps to its first pose, or RESET_TIMES as fast as ever."""
         way, usual_m = float(np.hypot(*step[:2])), max(self.fastest, USUAL_M_S) * duration_ns * 1e-9
         home = pose == self.home and way > 2.0 * usual_m
         known = self.steps >= LEAST_STEPS and way > RESET_M

@@ -139,7 +139,7 @@ class SourceNode:
         )
 
     def head(self, *, again: bool = False) -> list[Outgoing]:
-        """Publish the stream's head if it has changed; again: in any case."""
+        """Publish the stream's head if it has changed, or again."""
         if not self._incarnation:
             return []
         last = self._incarnation == self.journal.incarnation
@@ -159,7 +159,7 @@ class SourceNode:
 
     @property
     def has_new_state(self) -> bool:
-        """Whether the end of the stream, or the driver's leaving, is not yet published."""
+        """Whether the stream's end, or the driver's leaving, is unpublished."""
         return self._said is not None and self._said.state != self.journal.state
 
     @property
@@ -168,7 +168,7 @@ class SourceNode:
         return self._has_credit and self._published < self.journal.count(self._incarnation)
 
     def refusal(self, message: m.Message) -> str | None:
-        """Return why to refuse a message that claims more than was numbered; None: accepted."""
+        """Reason to refuse a message that claims more than was numbered, or None."""
         refused = absurd(message)
         if refused is not None or not isinstance(message, m.Progress | m.Done):
             return refused
@@ -275,7 +275,7 @@ class SourceNode:
 
     @property
     def waits_for(self) -> str:
-        """The required nodes that are absent, in words; empty: none."""
+        """The required nodes that are absent, in words."""
         needed = [ch.robot_node(self._robot), *([] if self.is_peer else ["central"])]
         missing = [node for node in needed if node not in self.alive]
         return " and ".join(missing)
@@ -303,7 +303,7 @@ class SourceNode:
 
     @property
     def team_pose(self) -> tuple[float, tuple[float, float, float]] | None:
-        """Time [s] and pose last published in the team's frame; None: the robot is not joined."""
+        """Time [s] and pose last published in the team's frame; None: not joined."""
         if self.pose is None or not self.pose.in_team_frame:
             return None
         x, y, theta = (float(v) for v in floats(self.pose.pose, "pose"))

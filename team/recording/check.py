@@ -75,9 +75,9 @@ def holes(log: Log) -> list[Finding]:
 class _Evidence:
     """Evidence about missing samples.
 
-    part: the log is a cut. repaired: it was unfinished. totals: by key, each process's final number
-    of publications, by its start. statuses: team times [ns] of the counted statuses of each node.
-    channels: those of `_READ` in the log. plain: keys of other channels.
+    totals: by key, each process's final number of publications, by its start. statuses: team times
+    [ns] of the counted statuses of each node. channels: those of `_READ` in the log. plain: other
+    keys.
     """
 
     part: bool
@@ -116,7 +116,7 @@ class _Evidence:
                         self.totals[key][tally.since_ns] = count
 
     def killed(self) -> Iterator[Finding]:
-        """Yield processes that announced no totals; none if no process did, as in memory."""
+        """Yield processes that announced no totals, if any process did."""
         for key, stamps_ns in sorted(self.statuses.items()) if self.totals else ():
             node = key.removesuffix("/status")
             for last in self.counters[key].unannounced(tuple(self.totals[key].values())):
@@ -127,8 +127,8 @@ class _Evidence:
                 )
 
     def findings(self) -> Iterator[Finding]:
-        """Yield findings, each key's once, views last; of a cut only gaps between two messages of
-        a publisher.
+        """Yield findings, each key's once, views last; of a cut only gaps within a publisher's
+        messages.
         """
         found = [*self._gaps(), *self._other_findings()]
         yield from sorted(found, key=lambda each: ch.VIEW.owner(each.where) is not None)
@@ -161,7 +161,7 @@ class _Evidence:
 
 
 def _key_of_note(note: str) -> str:
-    """Key in a recorder's note, as `view/map` of `missing: view/map: 20–22`."""
+    """Key in a recorder's note `missing: view/map: 20–22`."""
     return note.removeprefix(MISSING).partition(": ")[0]
 
 

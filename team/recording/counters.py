@@ -1,6 +1,6 @@
-"""Counters of one key: missing and duplicate publications of a log.
+"""Counters of one key, from 0 for each process: missing and duplicate publications of a log.
 
-A publisher counts its publications on a key from 0. A life is the publications of one process.
+A life is the publications of one process.
 """
 
 from array import array
@@ -17,7 +17,7 @@ LATEST_NS = 2**63 - 1  # largest wall clock [ns]; later ones are from damaged or
 
 
 class Counters:
-    """Counters and wall clocks [ns] of one key's samples in file order: 16 B each."""
+    """Counters and wall clocks [ns] of one key's samples in file order."""
 
     def __init__(self) -> None:
         self._counters = array("q")
@@ -37,8 +37,8 @@ class Counters:
     ) -> list[str]:
         """Find defects, one line each.
 
-        part: of a cut, earlier publications are not missing. numbered: messages have numbers of
-        their own. totals: publishers' final counts.
+        part: of a cut, earlier publications are not missing. numbered: messages have own numbers.
+        totals: publishers' final counts.
         """
         counters, walls = self._arrays()
         order = np.lexsort((walls, counters))
@@ -67,7 +67,7 @@ class Counters:
         return np.frombuffer(self._counters, np.int64), np.frombuffer(self._walls, np.int64)
 
     def unannounced(self, totals: Sequence[int]) -> list[int]:
-        """Return the position of the last publication of each life that has no total."""
+        """Return the position of the last publication of each life without a total."""
         counters, walls = self._arrays()
         lives = split_lives(counters, walls)
         published = [int(counters[life[-1]]) + 1 for life in lives]
@@ -78,9 +78,8 @@ class Counters:
 def split_lives(counters: Int64[np.ndarray, " n"], walls: Int64[np.ndarray, " n"]) -> list[Life]:
     """Split publications, in order of arrival, into lives of their publisher.
 
-    A life ends where the counters, ordered by wall clock or by arrival, do not ascend. The order
-    with fewer lives is used, then with fewer gaps: a set clock adds to the first, late arrivals to
-    the second.
+    A life ends where the counters, by wall clock or by arrival, do not ascend. The order with fewer
+    lives is used, then with fewer gaps: a set clock adds to the first, late arrivals to the second.
     """
     if not len(counters):
         return []
@@ -119,10 +118,9 @@ def _lacks(present: IntervalSet, counter: int) -> bool:
 
 
 def match_totals(published: Sequence[int], totals: Sequence[int]) -> list[tuple[int, int | None]]:
-    """Match each process's published total to a life, or to None.
+    """Match each process's total to a life: equal numbers first, then the largest life with fewer.
 
-    Equal numbers first; then each total takes the largest remaining life with fewer publications. A
-    life without total belongs to a killed process.
+    None: without a life. A life without total is of a killed process.
     """
     free = dict(enumerate(published))
     found: list[tuple[int, int | None]] = []

@@ -30,7 +30,7 @@ class Report(NamedTuple):
 
 
 def read_undamaged(log: Log, damaged: list[str]) -> Iterator[Sample]:
-    """Yield the samples of every undamaged chunk; add the damage of others to `damaged`."""
+    """Yield the samples of undamaged chunks; add the damage of others to `damaged`."""
     try:
         for chunk in log.chunks():
             if isinstance(chunk, LogError):
@@ -42,7 +42,7 @@ def read_undamaged(log: Log, damaged: list[str]) -> Iterator[Sample]:
 
 
 def repair_log(path: str | Path, out: str | Path) -> Report:
-    """Copy every undamaged chunk of a log to a new, complete log `out`, noted if it was unfinished.
+    """Copy every undamaged chunk of a log to a new, complete log `out`.
 
     Raises `LogError` if `path` is no log, `RecorderError` if `out` exists.
     """
@@ -154,7 +154,7 @@ class KeySummary:
 
     @property
     def rate_hz(self) -> float | None:
-        """Messages per second of team time, (n − 1) / (last − first); None for one instant."""
+        """Messages per second of team time, (n − 1) / (last − first), or None."""
         if self.last_ns == self.first_ns:
             return None
         return (self.messages - 1) * 1e9 / (self.last_ns - self.first_ns)
@@ -212,9 +212,8 @@ def cut(
 ) -> int:
     """Write the samples of [from_s, to_s) on these channels to a new log; return their number.
 
-    Times are seconds of team time since the first measurement; None: no bound. Earlier messages of
-    `STANDING` channels are included. Raises `LogError`, before creating `out`, for an empty result
-    or a damaged log.
+    Times are seconds since the first measurement; None: no bound. Earlier messages of `STANDING`
+    channels are included. Raises `LogError`, before creating `out`, if it is empty or damaged.
     """
     summary = summarise_log(log)
     if summary.damaged:

@@ -1,7 +1,7 @@
 """Numbered streams of a log: present and missing numbers.
 
-A source numbers measurements across all of its robot's sensor channels; the robot numbers submaps.
-Ends, heads and progress name totals, so missing numbers are detected at a stream's end, too.
+A source numbers measurements across all sensor channels of a robot; the robot numbers submaps.
+Ends, heads and progress name totals, so numbers missing at a stream's end are detected.
 """
 
 from array import array
@@ -60,7 +60,7 @@ class Received:
     def lacking(self, tally: m.Tally, awaited: set[str]) -> dict[str, int]:
         """Return the keys of a process with missing samples, each with the number received.
 
-        awaited: keys whose publisher may still have samples; other keys need only the newest.
+        awaited: keys that may still have samples; others need only the newest.
         """
         found = {}
         for key, count in zip(tally.keys, tally.counts, strict=True):
@@ -247,7 +247,7 @@ _DECODER = msgspec.msgpack.Decoder(_Head)
 
 
 def numbered_in(payload: bytes) -> _Head | None:
-    """Return the head of a numbered message, or None if the payload does not decode."""
+    """Return the head of a numbered message, or None."""
     try:
         return _DECODER.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):

@@ -48,7 +48,7 @@ def check_continues(
     same_run: bool = False,
     ends: Sequence[Channel] = (FINAL_MAP,),
 ) -> bool:
-    """Return whether the run of the log continues; False: it has ended and only joining remains.
+    """Return whether the run of the log continues; False: only joining remains.
 
     It has the same team and scenario and wrote within the hour (not asked of the same_run), or
     before the wall clock was set. ends: maps that end the team. Raises `LogError` for another log.
@@ -116,7 +116,7 @@ def _without_leftovers(path: Path) -> Parts:
 
 
 def join_parts(path: Path) -> list[Path]:
-    """Join a log's parts by copying whole chunks; return the remaining files, one on success."""
+    """Join a log's parts; return the remaining files, one on success."""
     found = _without_leftovers(path)
     whole = path.with_name(path.name + JOINING)
     whole.unlink(missing_ok=True)
@@ -187,8 +187,7 @@ class OwnLog:
 def own_log(path: Path, team: str) -> Iterator[OwnLog]:
     """Write samples to a log within a context; after a restart, to a further part.
 
-    A write error is reported, and the process continues. Raises `RecorderError` if no log can be
-    created.
+    A write error is reported, and the process continues. Raises `RecorderError` without a log.
     """
     recorder, inventory = next_part(path, team, {**provenance(), OWN: path.name})
     own = OwnLog(recorder, inventory)

@@ -14,7 +14,7 @@ _PACKAGES = ("teamslam", "numpy", "scipy", "eclipse-zenoh", "msgpack", "mcap")
 
 
 def provenance() -> dict[str, str]:
-    """Return versions, processor, core and estimation of this process for a log's metadata."""
+    """Return versions, processor, core and estimation of this process."""
     versions = {f"version.{package}": version(package) for package in _PACKAGES}
     return {
         **versions,
@@ -30,7 +30,7 @@ def provenance() -> dict[str, str]:
 
 
 def estimation_digest() -> str:
-    """Return 16 hex digits of the SHA-256 of all `team/estimation` sources in path order."""
+    """Return 16 hex digits of the SHA-256 of all `team/estimation` sources."""
     digest = hashlib.sha256()
     for source in sorted(ESTIMATION.rglob("*.py")):
         digest.update(f"{source.relative_to(ESTIMATION).as_posix()}\n".encode())
@@ -39,10 +39,7 @@ def estimation_digest() -> str:
 
 
 def arithmetic() -> str:
-    """Return the platform on which the bits depend, besides program and libraries.
-
-    The C library's logarithm affects the tails of NumPy's normal numbers.
-    """
+    """Return the platform: the C library affects the tails of NumPy's normal numbers."""
     return " ".join((machine(), *libc_ver())).strip()
 
 

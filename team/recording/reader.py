@@ -153,7 +153,7 @@ def _last_joined(log: LogFile | None) -> int:
 
 
 def _is_of(first: LogFile | None, log: LogFile | None, path: Path) -> bool:
-    """Return whether a part is of the first file's log; earlier versions' logs have no LOG_ID."""
+    """Whether a part is of the first file's log; earlier versions' logs have no LOG_ID."""
     if first is None or log is None:
         return path.stat().st_size == 0
     same = LOG_ID, "scenario"
@@ -185,9 +185,7 @@ class Count(NamedTuple):
 
 @dataclass
 class Channels:
-    """Keys and schemas that one file has declared so far; names: of the channels to read; None:
-    all.
-    """
+    """Keys and schemas that a file has declared so far; names: channels to read; None: all."""
 
     names: set[str] | None = None
     keys: dict[int, str | None] = field(default_factory=dict)
@@ -196,11 +194,10 @@ class Channels:
 
 @dataclass(frozen=True)
 class Log:
-    """A log on disk.
+    """A log on disk, read up to its last whole chunk.
 
-    complete: its last recorder finished; else it is read up to its last whole chunk. metadata:
-    provenance. files: consecutive parts. declared: the last declaration of each key. reading:
-    receives the share read in every pass.
+    complete: its last recorder finished. metadata: provenance. files: consecutive parts. declared:
+    the last declaration of each key. reading: receives the share read in every pass.
     """
 
     path: Path
@@ -222,7 +219,7 @@ class Log:
             yield from chunk
 
     def counts(self) -> dict[str, Count]:
-        """Count messages and payload bytes of each key by reading the whole log."""
+        """Count messages and payload bytes of each key."""
         counts: dict[str, Count] = {}
         for sample in self.samples():
             messages, size = counts.get(sample.key, Count(0, 0))
@@ -321,7 +318,7 @@ def log_of(files: Sequence[LogFile]) -> Log:
 
 
 def _stamp_in(payload: bytes) -> int:
-    """Return the stamp of a message logged at zero: MCAP times cannot be negative."""
+    """Stamp of a message logged at zero, since MCAP times cannot be negative."""
     unpacker = msgpack.Unpacker()
     unpacker.feed(payload[:128])  # tag and stamp are within
     try:
@@ -351,7 +348,7 @@ class Tail:
     _channels: Channels = field(default_factory=Channels)
 
     def more(self) -> list[Sample]:
-        """Return newly written samples of whole chunks, about MOST at most. Raises `LogError`."""
+        """Return newly written samples of whole chunks, about MOST at most; raises `LogError`."""
         if self.ended or (self.log is None and not self._try_open()):
             return []
         assert self.log is not None

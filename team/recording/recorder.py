@@ -1,8 +1,8 @@
 """Write samples into an MCAP file with unchanged payload bytes.
 
-Channel: full key, encoding `msgpack`, JSON Schema of its message; views use those of their viewers.
-Log time: team time, at least 0. Publish time: publisher's wall clock. Sequence: counter modulo 2³².
-The metadata record "teamslam" describes run and program.
+Channel: full key, encoding `msgpack`, JSON Schema of its message (docs/wire.md); views use those of
+their viewers. Log time: team time, at least 0. Publish time: publisher's wall clock. Sequence:
+counter modulo 2³². The metadata record "teamslam" describes run and program.
 """
 
 import json
@@ -40,9 +40,7 @@ class Declaration(NamedTuple):
 
 
 def declaration_of(key: str, tag: str = "") -> Declaration | None:
-    """Return the declaration of a relative key, for a message's tag if it has several; None: no
-    row.
-    """
+    """Return the declaration of a relative key, of a message's tag if it has several, or None."""
     found = channel_of(key)
     if found is not None:
         kind = found[0].kind_of(tag)
@@ -74,7 +72,7 @@ class RecorderError(RuntimeError):
 
 
 class Recorder:
-    """Write one log on a thread, whose errors are raised by the next call, as `RecorderError`."""
+    """Write one log on a thread, whose errors the next call raises as `RecorderError`."""
 
     def __init__(self, path: str | Path, team: str, metadata: Mapping[str, str]) -> None:
         self.path = Path(path)
@@ -203,7 +201,7 @@ class Recorder:
 
 
 def _open_writer(file: IO[bytes], metadata: dict[str, str]) -> Writer:
-    """Open a writer and write header and metadata first, for a log whose recorder is killed."""
+    """Open a writer; header and metadata come first, for a log whose recorder is killed."""
     writer = Writer(file)
     try:
         writer.start(profile="teamslam")

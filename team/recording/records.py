@@ -69,7 +69,7 @@ def read_index(file: IO[bytes], path: Path) -> Iterator[Frame]:
 
 
 def check_index(file: IO[bytes]) -> str | None:
-    """Return the defect of a complete file's index; None if its CRC fits or none was written.
+    """Return the defect of a complete file's index, or None.
 
     The CRC spans the summary section and the footer up to the CRC itself.
     """

@@ -23,8 +23,8 @@ from teamslam.team.wire.request_times import RequestTimes
 def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:
     """Yield (delay [s] after the previous one, sample), in the given order, at `speed` × team time.
 
-    delay = max(0, t − newest stamp so far)/speed: late samples and the first one are published at
-    once, and delays sum to the elapsed team time. Raises ValueError unless speed > 0.
+    delay = max(0, t − newest stamp so far)/speed: delays sum to the elapsed team time. Raises
+    ValueError unless speed > 0.
     """
     if not speed > 0.0:
         raise ValueError(f"out of bounds: speed {speed} is not positive")

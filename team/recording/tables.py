@@ -1,7 +1,7 @@
 """Export a log as tables, CSV or Parquet (pyarrow), one per channel with a row per message.
 
-Columns: key, counter, wall_ns, then the message's fields. Arrays are numbers with spaces between in
-CSV, exactly readable, lists in Parquet. Digests are hexadecimal, lists and tables of parts JSON.
+Columns: key, counter, wall_ns, then the message's fields. Arrays are exact numbers with spaces
+between in CSV, lists in Parquet. Digests are hexadecimal, lists and tables of parts JSON.
 """
 
 import csv
@@ -36,7 +36,7 @@ _ARRAYS: dict[str, Callable[[bytes, str], NDArray[Any]]] = {
 
 @dataclass
 class Exported:
-    """Rows of each written file, and number of invalid messages, which are omitted."""
+    """Rows of each written file, and number of omitted invalid messages."""
 
     rows: dict[Path, int] = field(default_factory=dict)
     unsound: int = 0

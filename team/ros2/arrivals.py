@@ -23,7 +23,7 @@ _NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
 
 
 def number_of(attachment: bytes) -> tuple[bytes, int] | None:
-    """Return a publisher's name and the number of its message; None for anything else."""
+    """Return a publisher's name and the number of its message, or None."""
     if len(attachment) == _NAMED.size:
         *fields, gid = _NAMED.unpack(attachment)
         return (gid, fields[1]) if tuple(fields[::2]) == _NAMES else None
@@ -62,7 +62,7 @@ class Lost:
 
 
 class Arrived(NamedTuple):
-    """One message, and its time of arrival by the monotonic clock [s]."""
+    """A message, and its time of arrival by the monotonic clock [s]."""
 
     kind: str
     payload: bytes
@@ -94,6 +94,6 @@ class Backlog:
 
     @property
     def oldest_s(self) -> float:
-        """Waiting time of the oldest message [s]; 0 without messages."""
+        """Waiting time of the oldest message [s]."""
         arrived = [queue[0].at_s for queue in self.waiting.values() if queue]
         return time.monotonic() - min(arrived) if arrived else 0.0

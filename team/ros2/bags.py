@@ -25,11 +25,11 @@ VERSION: Final = 9  # version of a new bag's metadata, that of ROS 2 Jazzy
 
 
 class BagError(ValueError):
-    """A bag that cannot be read; the text names it and the remedy."""
+    """A bag that cannot be read; the text has the remedy."""
 
 
 class Topic(NamedTuple):
-    """A topic of a bag: its type, and its number of messages."""
+    """A topic of a bag: type, and number of messages."""
 
     name: str
     kind: str
@@ -78,12 +78,12 @@ _FAULTS = (AnyReaderError, OSError, ValueError, KeyError, AssertionError)
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a file has the suffix of a bag, or a folder contains one."""
+    """Whether a file has the suffix of a bag, or a folder contains one."""
     return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file() or bool(_parts(path))
 
 
 def _parts(path: Path) -> list[Path]:
-    """Return the files of a bag whose recorder was killed before it wrote metadata.yaml."""
+    """Files of a bag whose recorder was killed before it wrote metadata.yaml."""
     if not path.is_dir() or (path / "metadata.yaml").is_file():
         return []
     inside = sorted(path.iterdir())
@@ -119,7 +119,7 @@ class NewBag:
         self._connections: dict[str, Connection] = {}
 
     def write(self, topic: str, kind: str, stamp_ns: int, data: bytes, latched: bool) -> None:
-        """Write a message at a time [ns], both log time and receive time."""
+        """Write a message at a time [ns] of log and receipt."""
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, kind, typestore=types(), offered_qos_profiles=[_quality(latched)]

@@ -64,7 +64,7 @@ Quaternion = tuple[float, float, float, float]  # x, y, z, w
 
 
 class DamagedError(ValueError):
-    """Bytes that are not a message of this type, or a message with impossible numbers."""
+    """Bytes that are no message of this type, or impossible numbers."""
 
 
 class OdometryRecord(NamedTuple):
@@ -111,8 +111,7 @@ class Transform(NamedTuple):
 class Tag(NamedTuple):
     """One detected tag.
 
-    covariance: of (x, y, z), row-major. kind: its class by the detector, where that is not its
-    name.
+    covariance: of (x, y, z), row-major. kind: its class by the detector, if not its name.
     """
 
     name: str
@@ -132,7 +131,7 @@ class TagsRecord(NamedTuple):
 class FixRecord(NamedTuple):
     """sensor_msgs/NavSatFix: latitude and longitude [deg] of the antenna, whose frame is `frame`.
 
-    degrees: None without a fix. covariance: (xx, xy, yy) [m²], x east and y north; None: unknown.
+    degrees: None without a fix. covariance: (xx, xy, yy) [m²], x east and y north, or None.
     """
 
     stamp_ns: int

@@ -46,9 +46,8 @@ class Names:
 def names_of(robot: str, odometry: str, odometry_frame: str, base_frame: str) -> Names:
     """Choose the names of a robot whose odometry comes on this topic.
 
-    Its topics are beside the odometry's; on the root they are in the namespace of its name.
-    Unprefixed frames in a namespace would be those of every robot, so their transforms are on the
-    namespace's own `tf`.
+    Its topics are beside the odometry's, or, on the root, in the namespace of its name. Unprefixed
+    frames in a namespace have their transforms on the namespace's own `tf`.
     """
     space = "/" + "/".join(odometry.strip("/").split("/")[:-1])
     is_prefixed = "/" in odometry_frame.strip("/")
@@ -96,7 +95,7 @@ def _zero(node: Nodetype, of: Any) -> Any:
 
 
 def build(kind: str, **values: Any) -> Any:
-    """Build a message of this type; parts are messages, or tables of their fields."""
+    """Build a message; parts are messages, or tables of their fields."""
     nodes: dict[str, Any] = dict(types().fielddefs[kind][1])
     given = {name: _part(nodes[name], value) for name, value in values.items()}
     return types().types[kind](**{**_zeros(kind), **given})
@@ -178,7 +177,7 @@ def path(stamp_ns: int, frame: str, poses: Iterable[tuple[int, Pose]]) -> Any:
 
 
 def ellipse(P: Float[np.ndarray, "2 2"]) -> tuple[float, float, float]:
-    """Return the axes' lengths [m] of the SIGMAS ellipse, and the first one's direction [rad]."""
+    """Axes' lengths [m] of the SIGMAS ellipse, and the first one's direction [rad]."""
     values, vectors = np.linalg.eigh(P)
     minor, major = (2.0 * SIGMAS * np.sqrt(np.maximum(values, 0.0))).tolist()
     return major, minor, float(np.arctan2(vectors[1, 1], vectors[0, 1]))
@@ -234,7 +233,7 @@ def detections(
 def diagnostics(
     stamp_ns: int, node: str, state: str, warnings: Sequence[str], figures: Mapping[str, float]
 ) -> Any:
-    """diagnostic_msgs/DiagnosticArray: a node's state, its warnings and its figures."""
+    """diagnostic_msgs/DiagnosticArray: a node's state, warnings and figures."""
     values = [{"key": name, "value": f"{value:g}"} for name, value in figures.items()]
     values += [{"key": f"warning {k}", "value": text} for k, text in enumerate(warnings, 1)]
     one = {

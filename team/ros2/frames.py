@@ -126,7 +126,7 @@ class Frames:
     def _ancestors(
         self, frame: str
     ) -> dict[str, tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]]:
-        """Return the frame and its ancestors, with rotation and translation to each."""
+        """The frame and its ancestors, with rotation and translation to each."""
         rotation, moved = np.eye(3), np.zeros(3)
         found = {frame: (rotation, moved)}
         while frame in self.parents and len(found) < DEEPEST:
@@ -138,7 +138,7 @@ class Frames:
         return found
 
     def mount(self, frame: str, base: str) -> Mount | None:
-        """Return the mount of the sensor with this frame; with a level z axis it is a camera's."""
+        """Mount of the sensor with this frame; with a level z axis it is a camera's."""
         found = self.base_from(frame, base)
         if found is None:
             return None

@@ -23,7 +23,7 @@ def expressions(topics: Iterable[str], domain: int) -> list[str]:
 
 
 def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
-    """Return topic and type of a key of rmw_zenoh; None for any other key."""
+    """Return topic and type of a key of rmw_zenoh, or None."""
     parts = key.split("/")
     if len(parts) < 4 or parts[0] != str(domain):
         return None
@@ -32,7 +32,7 @@ def of_rmw(key: str, domain: int) -> tuple[str, str] | None:
 
 
 def of_token(key: str) -> tuple[str, str] | None:
-    """Return topic and type of a bridge's liveliness token; None for any other key."""
+    """Return topic and type of a bridge's liveliness token, or None."""
     parts = key.split("/")
     if len(parts) < 6 or parts[2:4] != ["@ros2_lv", "MP"]:
         return None
@@ -55,7 +55,7 @@ def _in_spaces(odometry: str, name: str) -> set[str]:
 
 
 class Publication(NamedTuple):
-    """Keys for subscribers by rmw_zenoh and behind the bridge, and tokens of the topic."""
+    """Keys for subscribers by rmw_zenoh and behind the bridge, and the topic's tokens."""
 
     rmw: str
     bridge: str

@@ -13,17 +13,17 @@ RobotName = Annotated[str, Meta(pattern="^[a-z][a-z0-9_]{0,31}$")]
 
 
 class TopicsError(ValueError):
-    """An unusable file of topics; the text names file, place and remedy."""
+    """Unusable file of topics; the text has file, place and remedy."""
 
 
 class RobotTopics(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The topics of one robot.
 
-    odometry: nav_msgs/Odometry, whose pose or speeds (twist, valid until the next message) are
-    chosen by `use`; geometry_msgs/TwistStamped; or tf2_msgs/TFMessage with the transform
+    odometry: nav_msgs/Odometry, of which `use` chooses the pose or the speeds (twist, until the
+    next message); geometry_msgs/TwistStamped; or tf2_msgs/TFMessage with the transform
     odometry_frame → base_frame. detections: messages of a detector, or tf2_msgs/TFMessage whose
     child frames are tags. fixes: sensor_msgs/NavSatFix, the antenna's position. truth:
-    nav_msgs/Odometry or a pose, for the evaluation.
+    nav_msgs/Odometry or a pose.
 
     teammates: robots by the number of the tag that they carry. landmarks: numbers of tags with
     other names. frames: those of its detections, where transforms do not assign them. names:

@@ -77,8 +77,8 @@ Measured = Pose | Speeds | Seen | Position
 class Translator:
     """Takes one robot's messages in order of arrival; counts those dropped, by reason.
 
-    mounts: of sensors by frame. antenna: its place (ahead, left) on the base. robot, owners: its
-    name among those that share its topics. datum: of fixes, which are dropped without one.
+    mounts: of sensors by frame. antenna: its place (ahead, left) on the base. owners: of the frames
+    of shared topics. datum: of fixes, which are dropped without one.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class Translator:
         return transform.child in self.topics.landmarks or bool(TAG.match(transform.child))
 
     def _is_ours(self, frame: str, shared: bool | None) -> bool:
-        """Return whether detections in a frame are this robot's.
+        """Whether detections in a frame are this robot's.
 
         shared: whether other robots have the topic; None: it has transforms, perhaps of unlisted
         robots.
@@ -252,7 +252,7 @@ class Translator:
         return self._some_decided
 
     def question(self) -> str:
-        """Describe the undecided frames, with the remedy; empty without any."""
+        """Describe the undecided frames, with the remedy, or ""."""
         frames = {frame for frame in self._unclaimed if self.owners.owner(frame) is None}
         return self.owners.question(self.robot, frames) if frames and self.undecided else ""
 
