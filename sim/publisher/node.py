@@ -234,7 +234,7 @@ class WorldNode:
         return []
 
     def _finish(self) -> None:
-        """End once an expected centre and all peers have final maps; peers need no absent centre."""
+        """End once an expected centre and all peers have final maps; peers need no absent one."""
         conclusions = [self._concluded[robot] for robot in self.peers if robot in self._concluded]
         agreed = (
             len(conclusions) == len(self.peers) and len({each.digest for each in conclusions}) <= 1

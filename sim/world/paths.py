@@ -47,7 +47,7 @@ def wrapped(angle: float) -> float:
 
 
 def follow_way_points(way_points: Float[np.ndarray, "W 2"], steps: int) -> Drive:
-    """Follow a polyline in steps of equal arc length, with chords at corners: rotate, then drive."""
+    """Follow a polyline in steps of equal arc length, chords at corners: rotate, then drive."""
     legs = hypot(*np.diff(way_points, axis=0).T)
     arc = np.concatenate(([0.0], np.cumsum(legs)))
     at = np.linspace(0.0, arc[-1], steps + 1)
