@@ -93,27 +93,30 @@ P_JOINED_TEAM = 0.1018  # chapter 5: paired t-test of tables 5.3 and 5.5
 
 
 Row = tuple[float | None, ...]  # errors [m] of robots 1 … 5, or of the team
+Source = Callable[[Options, Dataset, Results], Sequence[Figures]]
+"""Computed figures of each column of a table."""
 QUICK_S = 300.0
 TEAM = "team"
 
 
 class _Method(NamedTuple):
-    """Row: name, and a figure per robot or of the team."""
+    """Row of a table: the name of a figure of a source."""
 
     name: str
-    row: Callable[[Options, Dataset, Results], Row]
-    colour: str
+    source: Source
+    figure: str
+    colour: str = ""
+
+    def row(self, options: Options, dataset: Dataset, results: Results) -> Row:
+        return tuple(each.get(self.figure) for each in self.source(options, dataset, results))
 
 
 class _Compared(NamedTuple):
-    """Paired t-test: text, printed p, two sides by set.
-
-    before: the other table's row by method.
-    """
+    """Paired t-test: text, printed p, and the other table's rows."""
 
     text: str
     printed_p: float
-    before: Mapping[str, Callable[[Options, Dataset, Results], Row]]
+    before: tuple[_Method, ...]
     printed_before: Mapping[str, Sequence[float]]
 
 
@@ -185,18 +188,13 @@ class _PrintedTable(NamedTuple):
                 [_paired(b, self.printed[n], one) for n, b in self.compared.printed_before.items()]
             )
         }
-        by_name = {method.name: method.row for method in self.methods}
-        for name, before in self.compared.before.items():
-            found[name] = _test(
-                [
-                    _paired(
-                        before(options, dataset, results),
-                        by_name[name](options, dataset, results),
-                        one,
-                    )
-                    for dataset in options.datasets
-                ]
-            )
+        by_name = {method.name: method for method in self.methods}
+        for before in self.compared.before:
+            rows = [
+                [each.row(options, dataset, results) for each in (before, by_name[before.name])]
+                for dataset in options.datasets
+            ]
+            found[before.name] = _test([_paired(old, new, one) for old, new in rows])
         return found
 
     def _draw(self, sets: Mapping[str, Mapping[str, Row]], path: Path) -> None:
@@ -236,52 +234,36 @@ def _profile(options: Options) -> Scenario:
 
 def _ekf(options: Options, dataset: Dataset, *, his: bool) -> Task:
     scenario = with_options(_profile(options), estimator="ekf-slam", fusion="alone")
-    return whole_run_task(
-        his_protocol(scenario) if his else scenario, dataset, "his protocol" if his else ""
-    )
+    return whole_run_task(his_protocol(scenario) if his else scenario, dataset, HIS if his else "")
 
 
 def _spherical(options: Options, dataset: Dataset) -> Task:
     return spherical_task(_profile(options), dataset)
 
 
-def _team(options: Options, dataset: Dataset) -> Task:
-    return team_task(_profile(options), dataset=dataset) if options.quick else team_on(dataset)
-
-
-def _singles(options: Options, dataset: Dataset) -> list[Task]:
-    scenario = _profile(options)
-    return [
-        team_task(
-            msgspec.structs.replace(scenario, robots=(robot,)), dataset=dataset, note=robot.id
-        )
-        for robot in scenario.robots
-    ]
-
-
 def _of_robots(
-    task: Callable[[Options, Dataset], Task], name: str
-) -> Callable[[Options, Dataset, Results], Row]:
-    def row(options: Options, dataset: Dataset, results: Results) -> Row:
-        robots = (results.of(task(options, dataset)) or {}).get("robots", {})
-        return tuple(robots.get(robot.id, {}).get(name) for robot in load("utias").robots)
-
-    return row
+    options: Options, dataset: Dataset, results: Results, task: Callable[[Options, Dataset], Task]
+) -> list[Figures]:
+    robots = (results.of(task(options, dataset)) or {}).get("robots", {})
+    return [robots.get(robot, {}) for robot in _ROBOTS]
 
 
-def _of_singles(name: str) -> Callable[[Options, Dataset, Results], Row]:
-    def row(options: Options, dataset: Dataset, results: Results) -> Row:
-        return tuple((results.of(t) or {}).get(name) for t in _singles(options, dataset))
-
-    return row
-
-
-def _of_spherical_team(options: Options, dataset: Dataset, results: Results, name: str) -> Row:
-    return ((results.of(_spherical(options, dataset)) or {}).get(TEAM, {}).get(name),)
+def _of_singles(options: Options, dataset: Dataset, results: Results) -> list[Figures]:
+    scenario = _profile(options)
+    alone = (
+        (msgspec.structs.replace(scenario, robots=(each,)), each.id) for each in scenario.robots
+    )
+    return [results.of(team_task(one, dataset=dataset, note=id_)) or {} for one, id_ in alone]
 
 
-def _of_team(options: Options, dataset: Dataset, results: Results, name: str) -> Row:
-    return ((results.of(_team(options, dataset)) or {}).get(name),)
+def _of_spherical_team(options: Options, dataset: Dataset, results: Results) -> list[Figures]:
+    return [(results.of(_spherical(options, dataset)) or {}).get(TEAM, {})]
+
+
+def _of_team(options: Options, dataset: Dataset, results: Results) -> list[Figures]:
+    quick = options.quick
+    task = team_task(_profile(options), dataset=dataset) if quick else team_on(dataset)
+    return [results.of(task) or {}]
 
 
 def _number(dataset: Dataset) -> str:
@@ -361,7 +343,10 @@ def _draw_sample(title: str, sample: Figures, path: Path) -> None:
 HIS, OURS = "his protocol", "ours"
 _COLOURS = (VERMILION, ORANGE, BLUE, SKY)
 _ROBOTS = ("r1", "r2", "r3", "r4", "r5")
-_HIS_EKF, _OUR_EKF = partial(_ekf, his=True), partial(_ekf, his=False)
+_HIS_EKF = partial(_ekf, his=True)
+_EKFS = (partial(_of_robots, task=_HIS_EKF), partial(_of_robots, task=partial(_ekf, his=False)))
+_JOINED = (partial(_of_robots, task=_spherical), _of_singles)
+_MAPS = ("rmse", "rmse_aligned")
 _DIFFERS = (
     "His filter's noise, his odometry's correction and what he did about set 1's exchanged "
     "landmarks are not printed: here all rows have the models of our profile and its repair. "
@@ -369,25 +354,20 @@ _DIFFERS = (
 )
 
 
-def _pair(
-    rows: Callable[[int, str], Callable[[Options, Dataset, Results], Row]],
-    figures: Sequence[str],
-) -> tuple[_Method, ...]:
-    found: list[_Method] = []
-    for k, name in enumerate((HIS, OURS)):
-        for source in figures:
-            full = f"{name}, aligned" if source.endswith("aligned") else name
-            found.append(_Method(full, rows(k, source), _COLOURS[len(found)]))
-    return tuple(found)
+def _pair(sources: Sequence[Source], figures: Sequence[str]) -> tuple[_Method, ...]:
+    rows = [
+        (f"{name}, aligned" if figure.endswith("aligned") else name, source, figure)
+        for name, source in zip((HIS, OURS), sources, strict=True)
+        for figure in figures
+    ]
+    return tuple(_Method(*row, colour) for row, colour in zip(rows, _COLOURS, strict=False))
 
 
-_EKFS = (_HIS_EKF, _OUR_EKF)
-_MAPS = ("rmse", "rmse_aligned")
 TABLE_5_1 = _PrintedTable(
     "Downs, table 5.1: maps of the EKF, one robot",
     _ROBOTS,
     EKF_MAPS,
-    _pair(lambda k, name: _of_robots(_EKFS[k], name), _MAPS),
+    _pair(_EKFS, _MAPS),
     (
         _DIFFERS,
         "Ours is the same filter with measurements sampled to half a second. The text explains "
@@ -400,7 +380,7 @@ TABLE_5_2 = _PrintedTable(
     "Downs, table 5.2: paths of the EKF, one robot",
     _ROBOTS,
     EKF_PATHS,
-    _pair(lambda k, _: _of_robots(_EKFS[k], "position_rmse"), ("position_rmse",)),
+    _pair(_EKFS, ("position_rmse",)),
     (
         _DIFFERS,
         "The printed paths are some eight times better than the printed maps that they were made "
@@ -410,15 +390,11 @@ TABLE_5_2 = _PrintedTable(
 )
 
 
-def _joined_row(k: int, name: str) -> Callable[[Options, Dataset, Results], Row]:
-    return _of_robots(_spherical, name) if k == 0 else _of_singles(name)
-
-
 TABLE_5_3 = _PrintedTable(
     "Downs, table 5.3: joined maps, one robot",
     _ROBOTS,
     JOINED_MAPS,
-    _pair(_joined_row, _MAPS),
+    _pair(_JOINED, _MAPS),
     (
         _DIFFERS,
         "A printed error of 0.0000 m is below the accuracy of the landmarks' survey, and rows 6 "
@@ -428,7 +404,7 @@ TABLE_5_3 = _PrintedTable(
     _Compared(
         "EKF maps (table 5.1) against joined maps (table 5.3)",
         P_EKF_JOINED,
-        {HIS: _of_robots(_HIS_EKF, "rmse"), OURS: _of_robots(_OUR_EKF, "rmse")},
+        _pair(_EKFS, ("rmse",)),
         EKF_MAPS,
     ),
 )
@@ -436,7 +412,7 @@ TABLE_5_4 = _PrintedTable(
     "Downs, table 5.4: smoothed paths, one robot",
     _ROBOTS,
     SMOOTHED_PATHS,
-    _pair(lambda k, _: _joined_row(k, "position_rmse"), ("position_rmse",)),
+    _pair(_JOINED, ("position_rmse",)),
     (
         _DIFFERS,
         "The printed 7.7·10⁻⁵ m is less than a tenth of the truth system's accuracy of a "
@@ -445,15 +421,11 @@ TABLE_5_4 = _PrintedTable(
 )
 
 
-def _team_row(k: int, name: str) -> Callable[[Options, Dataset, Results], Row]:
-    return partial(_of_spherical_team if k == 0 else _of_team, name=name)
-
-
 TABLE_5_5 = _PrintedTable(
     "Downs, table 5.5: joined maps of five robots",
     (TEAM,),
     {number: (error,) for number, error in TEAM_MAPS.items()},
-    _pair(_team_row, _MAPS),
+    _pair((_of_spherical_team, _of_team), _MAPS),
     (
         _DIFFERS,
         "He exchanges maps at each mutual sighting. Here the robots' whole maps are aligned once, "
@@ -463,7 +435,7 @@ TABLE_5_5 = _PrintedTable(
     _Compared(
         "the mean of single joined maps (table 5.3) against the team's (table 5.5)",
         P_JOINED_TEAM,
-        {HIS: _joined_row(0, "rmse"), OURS: _joined_row(1, "rmse")},
+        _pair(_JOINED, ("rmse",)),
         JOINED_MAPS,
     ),
 )
