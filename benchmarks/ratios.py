@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.baseline import conclude
-from teamslam.sim.studies.estimators.innovation import innovation
-from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.estimators.robot_step import RobotStep, innovation
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
 from teamslam.team.estimation.models import Increment, increment_of, segmenter_of

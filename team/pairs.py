@@ -13,7 +13,7 @@ maps. measurements: the sensor channels; the robots' estimators are then for the
 
 
 class EstimatorRow(NamedTuple):
-    """made_by: a `teamslam.sim.studies.robots.estimator.Factory`; of `hybrid` its mapper. feeds:
+    """made_by: a `teamslam.sim.studies.robots.filters.Factory`; of `hybrid` its mapper. feeds:
     rules, beside those that name it. needs_map: it is given a prior map.
     """
 
@@ -65,7 +65,7 @@ RULES: Mapping[str, RuleRow] = MappingProxyType(
         "svd-join": RuleRow(_SVD, "submap"),
         "svd-join-spherical": RuleRow(_SVD, "submap"),
         "joint-fastslam": RuleRow(
-            "teamslam.sim.studies.rules.joint_fastslam_rule:JointFastSlamCentre",
+            "teamslam.sim.studies.rules.measurement_rules:JointFastSlamCentre",
             "measurements",
             _CHEAP,
         ),

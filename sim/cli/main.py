@@ -132,7 +132,7 @@ def main() -> None:
 
 def _advice(error: Exception) -> tuple[int, str] | None:
     from teamslam.sim.datasets.tables import DatasetError
-    from teamslam.sim.scenarios.checks import ScenarioError
+    from teamslam.sim.scenarios.document import ScenarioError
     from teamslam.team.keys.roster import KeysError
     from teamslam.team.recording.reader import LogError
     from teamslam.team.recording.recorder import RecorderError

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import click
 
 from teamslam.sim.cli.commands import argument, fail, network, option, rare, refuse, refusing
-from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
 from teamslam.team.config import MAP, Estimator, FusionRule

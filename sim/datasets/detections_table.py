@@ -9,8 +9,7 @@ import numpy as np
 from teamslam.sim.datasets.csv_table import CsvTable, cells_of, covariances_of, read_table
 from teamslam.sim.datasets.folder_files import DETECTIONS, name_table
 from teamslam.sim.datasets.folder_tables import POLAR, POLAR_COVARIANCE, check_polar
-from teamslam.sim.datasets.scans import on_circle
-from teamslam.sim.datasets.tables import File
+from teamslam.sim.datasets.tables import File, on_circle
 from teamslam.sim.world.identities import in_order
 from teamslam.sim.world.streams import NO_LABEL, Detections
 from teamslam.team.shapes import Float, Int64, UInt32

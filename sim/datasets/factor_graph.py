@@ -9,8 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
-from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.tables import DatasetError, Scans, count_note, first_of_each, on_circle
 from teamslam.sim.world.streams import (
     RobotStream,
     StartPose,

@@ -17,8 +17,7 @@ from teamslam.sim.datasets.folder_tables import (
     STEERED,
     Rows,
 )
-from teamslam.sim.datasets.scans import on_circle
-from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.datasets.tables import DatasetError, on_circle
 from teamslam.sim.world.streams import Intervals, moved
 from teamslam.team.config import Bounds
 from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S

@@ -12,7 +12,7 @@ from teamslam.sim.datasets.csv_table import (
     numbers_in,
     pose_covariances,
 )
-from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
+from teamslam.sim.datasets.tables import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.world.streams import StartPose
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
 

@@ -13,11 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from teamslam.sim.datasets.scans import Scans, count_note, first_of_each, on_circle
 from teamslam.sim.datasets.tables import (
     EXPECTED,
     DatasetError,
     File,
+    Scans,
+    count_note,
+    first_of_each,
+    on_circle,
     open_data_set,
     optional_table,
     table,

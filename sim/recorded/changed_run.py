@@ -11,7 +11,7 @@ import msgspec
 from teamslam.central.saved_maps import describe_repetition
 from teamslam.sim.in_memory.team import Conditions, Partition, run_nodes
 from teamslam.sim.recorded.world import RecordedWorld, Samples
-from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.team.config import (
     MAP,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from teamslam.sim.datasets.detections_table import merge_detections
-from teamslam.sim.datasets.scans import count_note
+from teamslam.sim.datasets.tables import count_note
 from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, loads
 from teamslam.sim.world.streams import (
     NO_LABEL,

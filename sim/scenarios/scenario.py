@@ -11,23 +11,21 @@ from typing import Any
 import msgspec
 
 from teamslam.central.config import CentralConfig, TeamConfig
-from teamslam.sim.scenarios.checks import (
-    TOP_LEVEL,
-    ScenarioError,
-    check_fields,
-    close,
-    plain_error,
-    types_of,
-)
 from teamslam.sim.scenarios.document import (
     MAX_ROBOTS,
+    TOP_LEVEL,
     Fields,
+    ScenarioError,
     builtin_names,
+    check_fields,
     checked_count,
     checked_table,
+    close,
     named_after,
     named_document,
+    plain_error,
     resolve,
+    types_of,
 )
 from teamslam.sim.world.config import (
     FolderWorld,

@@ -14,7 +14,7 @@ from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
 from teamslam.sim.datasets.tables import open_data_set as open_files
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
 from teamslam.sim.datasets.utias import ROBOTS, present_robots, utias
-from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import (
     FolderWorld,

@@ -22,8 +22,13 @@ from teamslam.team.config import Bounds
 from teamslam.team.driver import journal as j
 from teamslam.team.driver import measurement_messages as make
 from teamslam.team.driver.link import Link
-from teamslam.team.driver.measurement_messages import DriverWarning, MeasurementError
-from teamslam.team.driver.motion import Odometer, Pose, relative_pose
+from teamslam.team.driver.measurement_messages import (
+    DriverWarning,
+    MeasurementError,
+    Odometer,
+    Pose,
+    relative_pose,
+)
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.keys.roster import KeysError
 from teamslam.team.saved_map import SavedMapError, read_map

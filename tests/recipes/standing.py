@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from teamslam.sim.studies.robots.estimator import NOTHING_NEW, Estimates, KnownMap
+from teamslam.sim.studies.robots.filters import NOTHING_NEW, Estimates, KnownMap
 from teamslam.team.config import RobotConfig
 from teamslam.team.core import OdometryInterval
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian

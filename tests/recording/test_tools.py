@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from teamslam.team.recording.check import DRAWN, check_log, find_misdeclaration
-from teamslam.team.recording.counters import Counters
+from teamslam.team.recording.check import DRAWN, Counters, check_log, find_misdeclaration
 from teamslam.team.recording.editing import MERGED, cut, merge, summarise_log
 from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder, schema_of

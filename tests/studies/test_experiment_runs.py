@@ -10,9 +10,15 @@ from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments import runner
 from teamslam.sim.studies.experiments.cases import Cases, Done
 from teamslam.sim.studies.experiments.catalogue import Entry
-from teamslam.sim.studies.experiments.experiment import Options, Outcome, Results, Table, runs_of
+from teamslam.sim.studies.experiments.experiment import (
+    Options,
+    Outcome,
+    Results,
+    Table,
+    Task,
+    runs_of,
+)
 from teamslam.sim.studies.experiments.runner import FAILURES, Plan, compute_outcomes
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import team_run, team_task
 from tests.commands import output_of
 from tests.scenarios import with_world
@@ -116,7 +122,9 @@ def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
     assert done.result == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(1.0)) == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(2.0)) is None
-    monkeypatch.setattr("teamslam.sim.studies.experiments.task.program_of", lambda _: "0" * 16)
+    monkeypatch.setattr(
+        "teamslam.sim.studies.experiments.experiment.program_of", lambda _: "0" * 16
+    )
     assert Cases(tmp_path).found(counted(1.0)) is None
 
 

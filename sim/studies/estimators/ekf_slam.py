@@ -8,8 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from teamslam.sim.studies.estimators.innovation import joint_innovation, slots_of
-from teamslam.sim.studies.estimators.robot_step import RobotStep, variances
+from teamslam.sim.studies.estimators.robot_step import (
+    RobotStep,
+    joint_innovation,
+    slots_of,
+    variances,
+)
 from teamslam.team import core
 from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import Innovation

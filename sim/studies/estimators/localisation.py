@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from teamslam.sim.studies.estimators import innovation as innovations
+from teamslam.sim.studies.estimators import robot_step
 from teamslam.sim.studies.estimators.ekf_slam import see
 from teamslam.sim.studies.estimators.plain_fastslam import pose_moments
 from teamslam.sim.studies.estimators.robot_step import RobotStep, variances
@@ -90,7 +90,7 @@ def innovation(state: Localisation, step: RobotStep) -> Innovation:
         means=np.tile(state.landmarks[read], (count, 1, 1)),
         covariances=np.zeros((count, known, 3)),
     )
-    return innovations.innovation(on_map, step)
+    return robot_step.innovation(on_map, step)
 
 
 def pose_gaussian(state: Localisation) -> PoseGaussian:

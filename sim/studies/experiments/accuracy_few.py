@@ -7,8 +7,7 @@ warning of a right map about more than a large or nonlinear covariance.
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
-from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,

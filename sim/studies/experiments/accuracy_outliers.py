@@ -11,9 +11,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
+    Task,
     seed_count,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,

@@ -4,8 +4,7 @@ A merge is wrong if a first pose lies outside its own 99.9 % ellipsoid.
 """
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Outcome, Results, Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     Shown,

@@ -13,9 +13,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
+    Task,
     without_datasets,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, Shown, table_of, team_task
 
 NORMAL_SCALE = (0.8, 1.25)

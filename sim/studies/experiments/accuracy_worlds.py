@@ -10,9 +10,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Outcome,
     Results,
     Table,
+    Task,
     seed_count,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import (
     OURS,
     Figures,

@@ -12,8 +12,7 @@ from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.experiments.drawing import add_grid, figure
-from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     mean,

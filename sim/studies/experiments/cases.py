@@ -16,7 +16,7 @@ from joblib import Memory, Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from teamslam.sim.studies.experiments.catalogue import Study
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Task
 
 FOLDER = "cases"
 _STORED = "output.pkl"

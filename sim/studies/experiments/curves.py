@@ -13,7 +13,7 @@ from teamslam.central.desk.evaluation.errors import Path, PoseErrors, pose_error
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.scenarios.scenario import Scenario, loads
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, expected_s, pair_name
 from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team import translate

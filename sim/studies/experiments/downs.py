@@ -28,9 +28,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
+    Task,
     without_datasets,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, table_of, team_task, with_world
 
 Robots = tuple[float, float, float, float, float]

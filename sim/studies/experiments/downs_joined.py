@@ -26,8 +26,7 @@ from teamslam.sim.studies.estimators.svd_joining import (
     reweight,
 )
 from teamslam.sim.studies.experiments.curves import estimated_poses, messages, true_landmarks
-from teamslam.sim.studies.experiments.experiment import Dataset
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Dataset, Task
 from teamslam.sim.studies.experiments.team_runs import (
     Figures,
     expected_s,

@@ -22,8 +22,7 @@ from teamslam.sim.studies.experiments.curves import (
     short,
     true_landmarks,
 )
-from teamslam.sim.studies.experiments.experiment import Dataset
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Dataset, Task
 from teamslam.sim.studies.experiments.team_runs import Figures, TimedRun, pair_name, scenario_task
 from teamslam.sim.studies.experiments.xu import Method, with_particles
 from teamslam.sim.world.config import UtiasWorld

@@ -16,6 +16,7 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
+    Task,
     without_datasets,
 )
 from teamslam.sim.studies.experiments.ma import (
@@ -27,7 +28,6 @@ from teamslam.sim.studies.experiments.ma import (
     SINGLE,
     ma_task,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import Method, Panel, draw_curves, numbers, row
 from teamslam.team.shapes import Float

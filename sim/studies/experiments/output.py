@@ -17,9 +17,8 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from teamslam.sim.studies.experiments.cases import Done
-from teamslam.sim.studies.experiments.experiment import Goal, Table
+from teamslam.sim.studies.experiments.experiment import Goal, Table, Task
 from teamslam.sim.studies.experiments.runner import Concluded
-from teamslam.sim.studies.experiments.task import Task
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 64rem; margin: 2rem auto; padding: 0 1rem; }

@@ -22,9 +22,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,
     Results,
+    Task,
     runs_of,
 )
-from teamslam.sim.studies.experiments.task import Task
 
 if TYPE_CHECKING:  # joblib, which is not a part of every install
     from teamslam.sim.studies.experiments.cases import Done

@@ -16,8 +16,7 @@ from teamslam.sim.recorded.chains import BatchReferenceError
 from teamslam.sim.scenarios.scenario import Scenario, loads, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.studies.batch_reference.reference import BatchReference, NoiseKind, batch_map
-from teamslam.sim.studies.experiments.experiment import Dataset, Table
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import Dataset, Table, Task
 from teamslam.sim.studies.experiments.true_minimum import true_minimum
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.streams import WorldStreams

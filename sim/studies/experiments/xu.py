@@ -18,8 +18,14 @@ from teamslam.central.desk.drawing import BLACK, BLUE, GREEN, PURPLE, VERMILION
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.studies.experiments.curves import curves_task
 from teamslam.sim.studies.experiments.drawing import BAND, Curves, add_grid, figure, spread
-from teamslam.sim.studies.experiments.experiment import Options, Outcome, Picture, Results, Table
-from teamslam.sim.studies.experiments.task import Task
+from teamslam.sim.studies.experiments.experiment import (
+    Options,
+    Outcome,
+    Picture,
+    Results,
+    Table,
+    Task,
+)
 from teamslam.sim.studies.experiments.team_runs import Figures, with_robots, with_world
 from teamslam.team.config import MotionNoise
 

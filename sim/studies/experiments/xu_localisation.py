@@ -29,9 +29,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
+    Task,
     combine_outcomes,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures, with_world
 from teamslam.sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes

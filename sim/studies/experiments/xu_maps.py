@@ -21,9 +21,9 @@ from teamslam.sim.studies.experiments.experiment import (
     Picture,
     Results,
     Table,
+    Task,
     combine_outcomes,
 )
-from teamslam.sim.studies.experiments.task import Task
 from teamslam.sim.studies.experiments.team_runs import Figures
 from teamslam.sim.studies.experiments.xu import (
     EKF,

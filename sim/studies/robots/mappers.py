@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from teamslam.sim.studies.estimators.feedback import absorb_fused_map
-from teamslam.sim.studies.robots.estimator import (
+from teamslam.sim.studies.robots.filters import (
     NOTHING_KNOWN,
     AbsorbsMaps,
     Associates,

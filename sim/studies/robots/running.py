@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 
 from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep
-from teamslam.sim.studies.robots.estimator import Estimates, KnownMap
-from teamslam.sim.studies.robots.filters import FILTERS
+from teamslam.sim.studies.robots.filters import FILTERS, Estimates, KnownMap
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import (

@@ -12,7 +12,7 @@ from teamslam.central.desk.verification.recorded import RerunError
 from teamslam.central.desk.verification.verification import Verification, verify
 from teamslam.sim.cli.rerun import app
 from teamslam.sim.recorded.changed_run import Changes, changed_run
-from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from teamslam.central.desk.verification.recorded import Recorded
-from teamslam.sim.scenarios.checks import ScenarioError
+from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.sim.scenarios.scenario import (
     builtin_names,
     dumps,

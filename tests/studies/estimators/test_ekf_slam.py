@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.sim.studies.estimators import ekf_slam
-from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
+from teamslam.team.estimation.hybrid_slam.window import NOTHING
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.submap_world import wrap
@@ -135,7 +135,7 @@ def short_run(seed, repeat):
     landmarks = rng.uniform(-12.0, 12.0, (6, 2))
     sensor = Sensor(range_sigma=0.05, bearing_sigma=0.005)
     motion = Increment(np.array([0.5, 0.0, 0.15]), np.diag([0.02, 0.01, 0.01]) ** 2)
-    truth, state, judged = np.zeros(3), ekf_slam.initial_state(np.zeros(3)), innovations.NOTHING
+    truth, state, judged = np.zeros(3), ekf_slam.initial_state(np.zeros(3)), NOTHING
     for _ in range(10):
         xi = np.array([0.02, 0.01, 0.01]) * rng.standard_normal(3)
         truth = compose(compose(truth, motion.mean), exponential(xi))

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from teamslam.sim.studies.estimators.innovation import innovation
-from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.studies.estimators.robot_step import RobotStep, innovation
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.models import Increment, predicted

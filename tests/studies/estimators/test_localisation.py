@@ -4,12 +4,12 @@ import functools
 import numpy as np
 import pytest
 
-from teamslam.sim.studies.estimators import innovation as innovations
 from teamslam.sim.studies.estimators import localisation
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
 from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team.estimation.hybrid_slam.window import NOTHING
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.submap_world import wrap
@@ -77,7 +77,7 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
 @functools.cache
 def short_run(seed, repeat):
     """NEES and NIS of eight steps; each measurement counts `repeat` times."""
-    random, judged = np.random.default_rng(seed), innovations.NOTHING
+    random, judged = np.random.default_rng(seed), NOTHING
     truth, state = np.zeros(3), localisation.initial_state(np.zeros(3), 1000, IDS, LANDMARKS)
     for _ in range(8):
         xi = np.array([0.1, 0.05, 0.05]) * random.standard_normal(3)

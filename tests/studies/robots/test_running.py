@@ -9,7 +9,7 @@ from teamslam.sim.studies.estimators import (
     plain_fastslam,
 )
 from teamslam.sim.studies.estimators.robot_step import RobotStep
-from teamslam.sim.studies.robots.estimator import (
+from teamslam.sim.studies.robots.filters import (
     NOTHING_KNOWN,
     AbsorbsMaps,
     InitialPose,

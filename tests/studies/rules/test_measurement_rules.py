@@ -9,7 +9,7 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.node import make_centre
 from teamslam.sim.studies.estimators import joint_fastslam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
-from teamslam.sim.studies.rules.joint_fastslam_rule import RESAMPLE_BELOW
+from teamslam.sim.studies.rules.measurement_rules import RESAMPLE_BELOW
 from teamslam.team import translate
 from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.models import increment_of
