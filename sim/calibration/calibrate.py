@@ -15,10 +15,7 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from teamslam.sim.calibration import claims, clocks, motion, sensor
-from teamslam.sim.calibration.consistency import (
-    central_figures,
-    factor_by_cost,
-)
+from teamslam.sim.calibration.consistency import central_figures, factor_by_cost
 from teamslam.sim.calibration.data import (
     LEAST_SPANS,
     Reference,
@@ -28,12 +25,7 @@ from teamslam.sim.calibration.data import (
     true_paths,
 )
 from teamslam.sim.calibration.detections import claim_notes, detection_figures, windows_of
-from teamslam.sim.calibration.figures import (
-    CalibrationError,
-    Figure,
-    jackknife,
-    with_figures,
-)
+from teamslam.sim.calibration.figures import CalibrationError, Figure, jackknife, with_figures
 from teamslam.sim.calibration.join import JoinedTeam, config_of, fold_of, join_team
 from teamslam.sim.calibration.own import marker_spread, own_constants
 from teamslam.sim.scenarios.scenario import Scenario
@@ -126,11 +118,7 @@ def _calibrate_by_truth(
     placed = claims.mount_note(data, scenario.robots[0].sensor)
     own = own_constants(data, depth=depth)
     learnt = with_figures(scenario, of_motion, of_sensor, own.robots)
-    folds = []
-    for label, world in worlds:
-        progress(f"joined map of {label} with the calibrated models")
-        team = join_team(world, learnt, lambda robot: progress(f"  {robot} is done"))
-        folds.append(team.fold)
+    folds = [team.fold for team in _join_calibrated(worlds, learnt, progress)]
     marker = marker_spread(data, depth=depth)
     strays = own.strays if marker is None else (*own.strays, marker)
     true = [_positions(world) for _, world in worlds]
@@ -225,11 +213,8 @@ def _calibrate_by_map(
             notes += _note_left_out(label, world, team.paths, "not in the team's joined map")
         found = (f for f in _motion_figures(data, learnt) if f.name in SCALES)
         figures = tuple(_add_systematic(f) for f in found)
-        learnt = with_figures(scenario, figures, ())
-    teams = []
-    for label, world in worlds:
-        progress(f"joined map of {label} with the calibrated models")
-        teams.append(join_team(world, learnt))
+        learnt = with_figures(scenario, figures)
+    teams = _join_calibrated(worlds, learnt, progress)
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
         of_central = _fit_factor_by_cost(teams[0], scenario.central, progress)
@@ -243,6 +228,16 @@ def _calibrate_by_map(
     return Calibration(
         figures, (), False, findings, of_central, clocks=_clock_figures(of_clocks, scenario)
     )
+
+
+def _join_calibrated(
+    worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
+) -> list[JoinedTeam]:
+    teams = []
+    for label, world in worlds:
+        progress(f"joined map of {label} with the calibrated models")
+        teams.append(join_team(world, scenario, lambda robot: progress(f"  {robot} is done")))
+    return teams
 
 
 def _fit_factor_by_cost(

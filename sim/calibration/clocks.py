@@ -58,9 +58,16 @@ def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
     """Clocks of robots with enough measurements on a known path; a robot that turns before driving
     has unknown speeds.
     """
+
+    def fit(part: Sequence[Reference]) -> Mapping[str, float]:
+        seen, driven = _detections_late(part, sensor), _odometry_late(part)
+        if seen is None or driven is None:
+            return {}
+        return {"detections": seen, "odometry": driven, "clock_offset_s": seen - driven}
+
     found = {}
     for robot, own in sorted(by_robot([each for each in data if not each.turns_first]).items()):
-        figures = {each.name: each for each in jackknife(_fit_of(sensor), own, UNITS)}
+        figures = {each.name: each for each in jackknife(fit, own, UNITS)}
         if len(figures) == len(UNITS):
             found[robot] = Clock(**figures)
     return found
@@ -123,16 +130,6 @@ def _move_detections(stream: RobotStream, clock: Clock) -> RobotStream:
     )
 
 
-def _fit_of(sensor: Sensor) -> Callable[[Sequence[Reference]], Mapping[str, float]]:
-    def fit(part: Sequence[Reference]) -> Mapping[str, float]:
-        seen, driven = _detections_late(part, sensor), _odometry_late(part)
-        if seen is None or driven is None:
-            return {}
-        return {"detections": seen, "odometry": driven, "clock_offset_s": seen - driven}
-
-    return fit
-
-
 def _at(data: Reference, late_ns: int) -> Reference:
     return replace(data, path=Path(data.path.stamps_ns + late_ns, data.path.poses))
 
@@ -193,16 +190,7 @@ def _step(
     ])  # fmt: skip
     gap = np.concatenate((points - true).T)
     sigma = np.hypot(sensor.range_sigma, sensor.bearing_sigma * ranges)
-    return float(huber(_affine(gap, J), np.concatenate([sigma, sigma]), np.zeros(5))[4])
-
-
-def _affine(
-    gap: Float[np.ndarray, " n"], J: Float[np.ndarray, "n p"]
-) -> Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " n"]]:
-    def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
-        return np.asarray(gap + J @ p)
-
-    return residual
+    return float(huber(lambda p: gap + J @ p, np.concatenate([sigma, sigma]), np.zeros(5))[4])
 
 
 def _odometry_late(data: Sequence[Reference]) -> float | None:
@@ -215,7 +203,7 @@ def _odometry_late(data: Sequence[Reference]) -> float | None:
             return None
         gap, J = driven - turned, np.column_stack([driven, np.ones(len(driven)), -rate])
         sigma = 1.4826 * float(np.median(np.abs(gap))) + 1e-9
-        return float(huber(_affine(gap, J), np.full(len(gap), sigma), np.zeros(3))[2])
+        return float(huber(lambda p: gap + J @ p, np.full(len(gap), sigma), np.zeros(3))[2])
 
     return _settle_time(step_at)
 

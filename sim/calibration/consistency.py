@@ -55,10 +55,10 @@ def central_figures(
 ) -> tuple[Figure, ...]:
     """Robots' own biases, covariance factor, monitor's normal scale, and landmark sigma."""
     progress("maps of single robots against the rest of their team")
-    fields = nest_figures(msgspec.to_builtins(scenario.central), strays, CentralConfig)
+    before = msgspec.to_builtins(scenario.central)
+    fields = nest_figures(before, strays, CentralConfig)
     for table in ("bias_sigma", "common_bias_sigma"):
-        fields_of_table = msgspec.to_builtins(getattr(scenario.central, table))
-        fields[table] = fields_of_table | msgspec.to_builtins(fields[table])
+        fields[table] = before[table] | fields[table]
     central = msgspec.convert(fields, CentralConfig)
     factor = covariance_factor(folds, central)
     if factor is None:

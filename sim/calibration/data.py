@@ -203,11 +203,10 @@ def too_short(stretches: int) -> str:
 
 def moving_stretches(streams: Iterable[RobotStream]) -> int:
     """Number of stretches of SPAN_S with motion."""
-    return sum(map(_count_moving, streams))
+    return sum(_count_moving(stream.intervals) for stream in streams)
 
 
-def _count_moving(stream: RobotStream) -> int:
-    driven = stream.intervals
+def _count_moving(driven: Intervals) -> int:
     if not len(driven.end_ns):
         return 0
     begin_ns = int(driven.end_ns[0] - driven.duration_ns[0])

@@ -12,13 +12,13 @@ from scipy.optimize import least_squares
 
 from teamslam.sim.calibration.data import Reference
 from teamslam.sim.scenarios.scenario import Scenario
-from teamslam.team.config import MotionModel, Sensor
 from teamslam.team.shapes import Float
 
 GROUPS = 5  # least number of parts left out in turn
 
 HUBER = 2.0
 
+M = TypeVar("M", bound=msgspec.Struct)
 T = TypeVar("T")
 Fit = Callable[[Sequence[T]], Mapping[str, float]]
 
@@ -93,30 +93,23 @@ def leave_out_groups(
     return tuple(figures)
 
 
-NOTHING: Mapping[str, Sequence[Figure]] = MappingProxyType({})
-
-
 def with_figures(
     scenario: Scenario,
     of_motion: Sequence[Figure],
-    of_sensor: Sequence[Figure],
-    of_robots: Mapping[str, Sequence[Figure]] = NOTHING,
+    of_sensor: Sequence[Figure] = (),
+    of_robots: Mapping[str, Sequence[Figure]] = MappingProxyType({}),
 ) -> Scenario:
     """Scenario with these figures; a robot's own take precedence."""
+
+    def changed(model: M, figures: Sequence[Figure]) -> M:
+        kind = type(model)
+        return msgspec.convert(nest_figures(msgspec.to_builtins(model), figures, kind), kind)
+
     robots = tuple(
         msgspec.structs.replace(
             robot,
-            motion=msgspec.convert(
-                nest_figures(msgspec.to_builtins(robot.motion), of_motion, MotionModel), MotionModel
-            ),
-            sensor=msgspec.convert(
-                nest_figures(
-                    msgspec.to_builtins(robot.sensor),
-                    (*of_sensor, *of_robots.get(robot.id, ())),
-                    Sensor,
-                ),
-                Sensor,
-            ),
+            motion=changed(robot.motion, of_motion),
+            sensor=changed(robot.sensor, (*of_sensor, *of_robots.get(robot.id, ()))),
         )
         for robot in scenario.robots
     )

@@ -177,20 +177,12 @@ def fit_motion(
     }
 
 
-def _sigma(
-    densities: Pair,
-    way: Values,
-    rotation: Values,
-) -> Values:
+def _sigma(densities: Pair, way: Values, rotation: Values) -> Values:
     variance = densities[0] ** 2 * way + densities[1] ** 2 * rotation
     return np.asarray(np.sqrt(variance + FLOOR_VARIANCE))
 
 
-def _densities(
-    residual: Values,
-    way: Values,
-    rotation: Values,
-) -> Pair:
+def _densities(residual: Values, way: Values, rotation: Values) -> Pair:
     """(per_m, per_rad) that maximise Σ log N(residual; 0, per_m² way + per_rad² rotation)."""
 
     def cost(logs: Pair) -> float:

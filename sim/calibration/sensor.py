@@ -205,10 +205,7 @@ def _lens(rows: _Rows, offset: float) -> list[float]:
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(error)))
     powers = rows.bearings[:, np.newaxis] ** np.arange(4)
 
-    def residual(p: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
-        return np.asarray(error - powers @ p)
-
-    found = huber(residual, np.full(len(error), sigma), np.zeros(4))
+    found = huber(lambda p: error - powers @ p, np.full(len(error), sigma), np.zeros(4))
     found[0] += offset
     return [float(each) for each in found]
 

@@ -10,13 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from teamslam.sim.datasets.tables import DatasetError, Scans, count_note, first_of_each, on_circle
-from teamslam.sim.world.streams import (
-    RobotStream,
-    StartPose,
-    WorldStreams,
-    moved,
-    no_detections,
-)
+from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams, moved, no_detections
 from teamslam.team.shapes import Float
 
 STEP_NS = 1_000_000_000  # time between two poses [ns] of a graph without times

@@ -2,12 +2,7 @@
 
 import numpy as np
 
-from teamslam.sim.datasets.csv_table import (
-    POSE_COVARIANCE,
-    CsvTable,
-    numbers_in,
-    pose_covariances,
-)
+from teamslam.sim.datasets.csv_table import POSE_COVARIANCE, CsvTable, numbers_in, pose_covariances
 from teamslam.sim.datasets.folder_tables import (
     DEGREE,
     INCREMENTS,

@@ -329,9 +329,7 @@ def start_of(table: CsvTable) -> StartPose | None:
     return StartPose(pose, covariance)
 
 
-def landmarks_of(
-    table: CsvTable,
-) -> tuple[UInt32[np.ndarray, " M"], Float[np.ndarray, "M 2"]]:
+def landmarks_of(table: CsvTable) -> tuple[UInt32[np.ndarray, " M"], Float[np.ndarray, "M 2"]]:
     """True landmarks, ascending."""
     ids, positions = table.names("landmark"), table.numbers(*POINTS)
     order = np.argsort(ids, kind="stable")

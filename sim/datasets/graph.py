@@ -110,6 +110,10 @@ class _Line(NamedTuple):
     keyword: str
     words: Sequence[str]
 
+    @property
+    def is_keyword(self) -> bool:
+        return self.keyword.replace("_", "").replace(":", "").isupper()
+
     def error(self, defect: str) -> DatasetError:
         """Error with file, line and text."""
         shown = " ".join([self.keyword, *self.words])[:80]
@@ -133,8 +137,9 @@ class _Line(NamedTuple):
         return found
 
 
-def _lines_of(path: Path) -> Iterator[_Line]:
-    text = path.read_bytes().decode("utf-8", errors="replace")
+def _lines_of(path: Path, most: int = -1) -> Iterator[_Line]:
+    with path.open("rb") as file:
+        text = file.read(most).decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         words = line.partition("#")[0].split()
         if words:
@@ -150,7 +155,7 @@ def _read_lines(
             raise line.error("a graph in three dimensions; planar ones are read")
         form = forms.get(line.keyword)
         if form is None:
-            if not line.keyword.replace("_", "").replace(":", "").isupper():
+            if not line.is_keyword:
                 raise line.error(f"no keyword {line.keyword!r}: known are {', '.join(forms)}")
             graph.unused[line.keyword] = graph.unused.get(line.keyword, 0) + 1
             continue
@@ -165,13 +170,10 @@ def _read_lines(
 def _first_line(path: Path) -> _Line | None:
     """First line of a graph; None for other files."""
     known = {*GRAPH_FORMS, *SPATIAL, "VERTEX_SE2:PRIOR", "EDGE_RANGE"}
-    with path.open("rb") as file:
-        head = file.read(HEAD).decode("utf-8", errors="replace")
-    for number, line in enumerate(head.splitlines(), 1):
-        words = line.partition("#")[0].split()
-        if words and words[0] in known:
-            return _Line(path.name, number, words[0], words[1:])
-        if words and not words[0].replace("_", "").replace(":", "").isupper():
+    for line in _lines_of(path, HEAD):
+        if line.keyword in known:
+            return line
+        if not line.is_keyword:
             return None
     return None
 
@@ -265,7 +267,7 @@ def _take(line: _Line, values: Float[np.ndarray, " n"], graph: FactorGraph) -> N
         case "VERTEX_SE2":
             key = _key(line, 1)
             graph.poses[key] = values
-            time = _Line(line.name, line.number, line.keyword, line.words[:1]).values(0)[0]
+            time = line._replace(words=line.words[:1]).values(0)[0]
             graph.stamps_ns[key] = round(float(time) * 1e9)
         case "VERTEX_XY":
             graph.landmarks[_key(line, 0)[1]] = values

@@ -17,12 +17,7 @@ from teamslam.sim.datasets.folder_tables import (
     POSES,
 )
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.importing.proposal import (
-    MOST_ROBOTS,
-    drop_line,
-    propose_map,
-    proposed_kinds,
-)
+from teamslam.sim.importing.proposal import MOST_ROBOTS, drop_line, propose_map, proposed_kinds
 from teamslam.sim.importing.tables import (
     MEASURED,
     REQUIRED,

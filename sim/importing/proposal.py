@@ -60,7 +60,6 @@ UNITS = {
 LARGEST_S = 1e11  # times from here on are no seconds
 MOST_ROBOTS = 100  # more values of a column are no names of robots
 _NONE: Mapping[str, Any] = MappingProxyType({})
-KIND = "<kind>"  # placeholder of a table's name
 PROPOSED = (*MEASURED, "truth", "landmarks", "start")
 FILE_NAMES: Mapping[str, Sequence[str]] = {
     "odometry": ("odom", "wheel", "encoder"),
@@ -90,15 +89,18 @@ class _Guess(NamedTuple):
 
 
 class _Proposed(NamedTuple):
+    """Table of a file; columns: TOML value of theirs by ours."""
+
     file: str
-    text: str
+    columns: Mapping[str, str]
+
+    def uses(self, column: str) -> bool:
+        return any(f'"{column}"' in theirs for theirs in self.columns.values())
 
 
 Files = Mapping[str, CsvTable]  # tables of one robot by file name
-
-
-Drops = Mapping[str, Mapping[str, str]]
-"""By robot and file, the line that drops the rows of the others."""
+Drop = tuple[str, Sequence[str]]  # a column, and its texts in rows of other robots
+Drops = Mapping[str, Mapping[str, Drop]]  # by robot and file
 
 
 def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops = _NONE) -> str:
@@ -111,23 +113,24 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops 
     found = {robot: _tables(files) for robot, files in robots.items()}
     _drop_shared_truth(robots, found, drops)
     comments = _add_odometry(found)
-    kinds = dict.fromkeys(kind for tables, _ in found.values() for kind in tables)
     shared: list[str] = []
     by_robot: dict[str, list[str]] = {robot: [] for robot in robots}
-    for kind in kinds:
+    for kind in dict.fromkeys(kind for tables, _ in found.values() for kind in tables):
         of = {
-            robot: _text_of(tables[kind], drops.get(robot, _NONE))
+            robot: (tables[kind], drops.get(robot, _NONE).get(tables[kind].file))
             for robot, (tables, _) in found.items()
             if kind in tables
         }
-        left = {robot: _unassigned(kind, found[robot][0], robots[robot], of[robot]) for robot in of}
-        if len(of) == len(found) and len(set(of.values())) == 1 and not own:
-            text = next(iter(of.values())).replace(KIND, kind)
-            shared.append(text + _name_unassigned(chain(*left.values())))
+        left = {
+            robot: _unassigned(found[robot][0], robots[robot], *table)
+            for robot, table in of.items()
+        }
+        first, *others = of.values()
+        if len(of) == len(found) and all(each == first for each in others) and not own:
+            shared.append(_text(kind, *first, chain(*left.values())))
             continue
-        for robot, text in of.items():
-            own_text = text.replace(KIND, f"robots.{robot}.{kind}")
-            by_robot[robot].append(own_text + _name_unassigned(left[robot]))
+        for robot, table in of.items():
+            by_robot[robot].append(_text(f"robots.{robot}.{kind}", *table, left[robot]))
     lacking = dict.fromkeys(
         f"# {robot}: {line}\n" if len(found) > 1 else f"# {line}\n"
         for robot, (_, lines_of) in found.items()
@@ -137,42 +140,33 @@ def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops 
 
 
 def _unassigned(
-    kind: str, tables: Mapping[str, _Proposed], files: Files, text: str
-) -> Sequence[str]:
-    """Columns that neither this table, with its `drop`, nor another one of its file has."""
-    file = tables[kind].file
-    texts = [text, *(each.text for each in tables.values() if each.file == file)]
-    columns = files[file].columns if file in files else ()
-    return [
-        each
-        for each in columns
-        if drop_line(each, []).removesuffix("[] }") not in text
-        and not any(f'"{each}"' in of for of in texts)
-    ]
+    tables: Mapping[str, _Proposed], files: Files, table: _Proposed, drop: Drop | None
+) -> list[str]:
+    """Columns of a file that neither its tables nor the `drop` have."""
+    beside = [each for each in tables.values() if each.file == table.file]
+    columns = files[table.file].columns if table.file in files else ()
+    used = {column for column in columns if any(each.uses(column) for each in beside)}
+    return [each for each in columns if each not in used and each != (drop or ("",))[0]]
 
 
-def _name_unassigned(columns: Iterable[str]) -> str:
-    names = ", ".join(dict.fromkeys(columns))
-    return f"# not assigned: {names}\n" if names else ""
-
-
-def _text_of(table: _Proposed, drops: Mapping[str, str]) -> str:
-    line = f'files = ["{table.file}"]\n'
-    return table.text.replace(line, line + drops.get(table.file, ""))
+def _text(name: str, table: _Proposed, drop: Drop | None, left: Iterable[str]) -> str:
+    lines = [f"[{name}]", f'files = ["{table.file}"]', *([drop_line(*drop)] if drop else [])]
+    lines += [f"[{name}.columns]", *(f"{ours} = {text}" for ours, text in table.columns.items())]
+    names = ", ".join(dict.fromkeys(left))
+    lines += [f"# not assigned: {names}"] if names else []
+    return "\n".join([*lines, ""])
 
 
 def drops_by_robot(files: Files) -> Drops:
-    """Lines for tables of several robots, by a column that names them; empty if the odometry has
-    none.
+    """Rows of others in tables of several robots, by a column that names them; empty if the
+    odometry has none.
     """
     tables = _tables(files)[0]
     columns = {
         table.file: column
         for table in tables.values()
         for column, cells in files[table.file].columns.items()
-        if names_robot(column)
-        and f'"{column}"' not in table.text
-        and 1 < len(set(cells)) <= MOST_ROBOTS
+        if names_robot(column) and not table.uses(column) and 1 < len(set(cells)) <= MOST_ROBOTS
     }
     if "odometry" not in tables or tables["odometry"].file not in columns:
         return {}
@@ -188,7 +182,7 @@ def drops_by_robot(files: Files) -> Drops:
         return {}
     return {
         robot: {
-            name: drop_line(column, [other for other in values[name] if other != own]) + "\n"
+            name: (column, [other for other in values[name] if other != own])
             for name, column in columns.items()
         }
         for robot, own in robots.items()
@@ -230,7 +224,7 @@ def _add_odometry(found: Mapping[str, tuple[dict[str, _Proposed], list[str]]]) -
         for other, model in models.items():
             if other in _words(model.file):
                 file = re.sub(rf"(?i)(?<![a-z0-9]){other}(?![a-z0-9])", robot, model.file)
-                tables["odometry"] = _Proposed(file, model.text.replace(model.file, file))
+                tables["odometry"] = model._replace(file=file)
                 comments += f"# {robot} has no odometry: expected {file}, as {model.file}\n"
                 break
     return comments
@@ -307,7 +301,7 @@ def _words(name: str) -> list[str]:
 
 
 def _tables(files: Files) -> tuple[dict[str, _Proposed], list[str]]:
-    """Text of each probable table, with KIND for its name; also what is missing."""
+    """Probable tables by kind, and comments on others."""
     guesses: list[_Guess] = []
     lacking: list[str] = []
     for name, table in files.items():
@@ -321,14 +315,12 @@ def _tables(files: Files) -> tuple[dict[str, _Proposed], list[str]]:
         best.setdefault(guess.kind, guess)
     tables: dict[str, _Proposed] = {}
     for guess in guesses:
-        kind, columns = guess.kind, guess.columns
+        kind = guess.kind
         if best[kind] is not guess:
             lacking.append(f"{guess.file}: might be {kind}, too")
             continue
-        columns |= _clock(columns.get("t_s", ""), files[guess.file])
-        rows = "".join(f"{ours} = {text}\n" for ours, text in columns.items())
-        text = f'[{KIND}]\nfiles = ["{guess.file}"]\n[{KIND}.columns]\n{rows}'
-        tables[kind] = _Proposed(guess.file, text)
+        columns = guess.columns | _clock(guess.columns.get("t_s", ""), files[guess.file])
+        tables[kind] = _Proposed(guess.file, columns)
         lacking += [
             f"{guess.file}: nothing for {ours}" for ours in REQUIRED[kind] if ours not in columns
         ]

@@ -22,11 +22,7 @@ app = Group()
 
 
 @app.declare("teamslam batch-reference runs/first", name="batch-reference")
-def batch_reference(
-    log: Source,
-    noise: Noise = "white",
-    json_file: JsonFile = None,
-) -> None:
+def batch_reference(log: Source, noise: Noise = "white", json_file: JsonFile = None) -> None:
     """The batch MAP over all raw measurements of a log: the accuracy that a team can reach."""
     from teamslam.sim.cli.importing import readable
     from teamslam.sim.recorded.chains import BatchReferenceError

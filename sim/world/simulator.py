@@ -6,7 +6,7 @@ streams are keyed by (seed, robot, purpose).
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -125,23 +125,16 @@ def _drive(world: SimulatedWorld, robot: RobotConfig, index: int, seed: int) -> 
 def _route(
     world: SimulatedWorld, robot: str, path: Float[np.ndarray, "W 2"] | None, seed: int
 ) -> tuple[Pose, Iterator[tuple[float, float]]]:
-    way_points = _random_way_points(world, robot, seed) if path is None else _each(path)
+    way_points = (
+        _random_way_points(world, robot, seed)
+        if path is None
+        else ((x, y) for x, y in path.tolist())
+    )
     if path is None and world.radius_m is not None:
         return (0.0, 0.0, 0.0), way_points
     first, second = next(way_points), next(way_points)
     start: Pose = (*first, atan2(second[1] - first[1], second[0] - first[0]))
-    return start, _behind(second, way_points)
-
-
-def _behind(
-    first: tuple[float, float], others: Iterator[tuple[float, float]]
-) -> Iterator[tuple[float, float]]:
-    yield first
-    yield from others
-
-
-def _each(path: Float[np.ndarray, "W 2"]) -> Iterator[tuple[float, float]]:
-    yield from map(tuple, path.tolist())
+    return start, chain((second,), way_points)
 
 
 def _random_way_points(

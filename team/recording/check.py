@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from teamslam.team.recording.editing import CUT, REPAIRED, read_undamaged
-from teamslam.team.recording.inventory import MISSING, Inventory
+from teamslam.team.recording.inventory import MISSING, NUMBERED, Inventory
 from teamslam.team.recording.reader import Log
 from teamslam.team.recording.recorder import Declaration, schema_of
 from teamslam.team.recording.records import check_index
@@ -231,7 +231,9 @@ class _Evidence:
     inventory: Inventory = field(default_factory=Inventory)
     counters: dict[str, Counters] = field(default_factory=lambda: defaultdict(Counters))
     totals: dict[str, dict[int, int]] = field(default_factory=lambda: defaultdict(dict))
-    statuses: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(_stamps))
+    statuses: dict[str, "array[int]"] = field(
+        default_factory=lambda: defaultdict(lambda: array("q"))
+    )
     last_word: tuple[str, ...] = ()
     channels: set[ch.Channel] = field(default_factory=set)
     plain: set[str] = field(default_factory=set)
@@ -290,7 +292,7 @@ class _Evidence:
                 continue
             if row is not None and not row[0].recorded:
                 continue
-            numbered = not self.part and row is not None and row[0] in _NUMBERED
+            numbered = not self.part and row is not None and row[0] in NUMBERED
             totals = tuple(self.totals.get(key, {}).values())
             lines = self.counters[key].findings(part=self.part, numbered=numbered, totals=totals)
             again = DRAWN if ch.VIEW.owner(key) is not None else ""
@@ -311,7 +313,6 @@ def _key_of_note(note: str) -> str:
     return note.removeprefix(MISSING).partition(": ")[0]
 
 
-_NUMBERED = (*ch.SENSORS, ch.SUBMAP)
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}
 _OF_AN_END = {ch.ROBOT_DONE, ch.FINAL_MAP}  # channels published after the end of the streams
 _TOTALS = {ch.END, ch.HEAD, ch.ROBOT_HEAD}
@@ -321,10 +322,6 @@ NO_END = "missing: the number of measurements is unknown"
 UNFINISHED = "its recorder did not finish it; `teamslam repair` completes it"
 NO_FINAL = "repaired, and without a final map: messages after its recorder died are not in it"
 DRAWN = "; `teamslam view LOG --export NEW` draws all views again"
-
-
-def _stamps() -> "array[int]":
-    return array("q")
 
 
 def _evidence(log: Log) -> _Evidence:

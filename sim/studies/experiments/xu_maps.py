@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from teamslam.central.desk.drawing import RED, TRUTH_COLOUR, colour_of
-from teamslam.sim.studies.experiments.drawing import (
-    as_map,
-    draw_map,
-    figure,
-    sample_curve,
-    spread,
-)
+from teamslam.sim.studies.experiments.drawing import as_map, draw_map, figure, sample_curve, spread
 from teamslam.sim.studies.experiments.experiment import (
     Options,
     Outcome,

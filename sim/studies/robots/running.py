@@ -12,11 +12,7 @@ from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep
 from teamslam.sim.studies.robots.filters import FILTERS, Estimates, KnownMap
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
-from teamslam.team.estimation.gaussian import (
-    LandmarkGaussian,
-    NotACovarianceError,
-    PoseGaussian,
-)
+from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, generator
 from teamslam.team.estimation.models import Increment, segmenter_of
 from teamslam.team.estimation.mount import moved_by, start_of_sensor
