@@ -51,13 +51,15 @@ def restricted(submap: m.Submap, maps: Iterable[m.SavedMap]) -> m.Submap:
 
 def in_saved_map(fold: Fold) -> Fold:
     """Return the fold with the island of the saved map alone, or empty; its reasons are why the
-    other islands are not in that one.
+    other islands are not in that one. Merges of other islands are not listed.
     """
     key = next((key for stream, key in sorted(fold.home.items()) if is_map(stream)), None)
     if key is None:
         return EMPTY_FOLD
     home = {stream: at for stream, at in fold.home.items() if at == key}
-    return replace(fold, home=home, starts={}, reasons={**fold.reasons, **_refusals(fold, key)})
+    joined = {stream: words for stream, words in fold.joined.items() if stream in home}
+    reasons = {**fold.reasons, **_refusals(fold, key)}
+    return replace(fold, home=home, starts={}, reasons=reasons, joined=joined)
 
 
 def _refusals(fold: Fold, key: Stream) -> dict[Stream, str]:

@@ -135,11 +135,12 @@ def reflected(points):
 
 @pytest.mark.parametrize("wrong", [reflected, elsewhere])
 def test_a_wrong_map_is_named_with_the_remedy_and_no_robot_is_said_to_be_mirrored(wrong):
-    samples, _, _ = short_day(localise=True, wrong=wrong)
+    samples, _, _ = short_day(localise=True, wrong=wrong, length_s=100)
     maps = [*messages_of(samples, m.FusedMap)]
     assert not [each for of in maps for each in of.diagnosis if each.cause == "mirrored"]
     apart = dict(not_joined(final_map(samples).reasons))
     assert set(", ".join(apart).split(", ")) == {"r1", "r2"}
+    assert not final_map(samples).joined
     for why in apart.values():
         assert "the saved map site" in why
         assert why.endswith("load the right map, or save a new one")
