@@ -35,6 +35,7 @@ from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
 from teamslam.team.estimation.map_joining.continuity import Seam
+from teamslam.team.estimation.map_joining.fold_association import recognise_moved
 from teamslam.team.estimation.map_joining.late_seams import find_late_seam
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
@@ -375,9 +376,15 @@ class TickFold:
             fold = self._fold_raw()
             if not fold.contributions:
                 return fold
-            fold = joining.solve_fold(fold, self.settings)
+            fold = self._solve_in_full(fold)
             if not self._convict(fold, math.inf) and not self.suspended:
                 return self._cut_late(fold)
+
+    def _solve_in_full(self, fold: joining.Fold) -> joining.Fold:
+        """Solve in full, again with the unnamed landmarks that have moved since a saved map."""
+        solved = joining.solve_fold(fold, self.settings)
+        moved = recognise_moved(solved) if fold.has_unnamed and fold.has_maps else solved
+        return solved if moved is solved else joining.solve_fold(moved, self.settings)
 
     def _cut_late(self, fold: joining.Fold) -> joining.Fold:
         """Fold again with the seams that only later submaps show (`late_seams`)."""
@@ -388,7 +395,7 @@ class TickFold:
             if seam is None:
                 break
             again = self._fold_others((), math.inf, None, (*fold.cuts, seam)).fold
-            fold = joining.solve_fold(again, self.settings)
+            fold = self._solve_in_full(again)
         return fold
 
     def _fold_raw(self) -> joining.Fold:

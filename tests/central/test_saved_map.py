@@ -34,8 +34,9 @@ from tests import build
 from tests.air import Air
 from tests.bits import SETS
 from tests.peer_team import PeerTeam, peer_world
-from tests.scenarios import final_only, with_world
+from tests.scenarios import final_only, scenario_in, with_world
 from tests.support import example
+from tests.trials.stress_world import MovedLandmark, StressWorld, write
 
 ALL = ("*",)
 
@@ -502,6 +503,43 @@ def test_a_landmark_without_identity_beyond_the_gate_is_gone_and_another_is_new(
     samples, _, _ = day(1, [hidden_site()], scenario=scenario, streams=streams)
     states = sorted(each.state for each in changed(final_map(samples)).values())
     assert states == ["gone", "new"]
+
+
+MOVED_AT_S = 200.0
+
+
+def two_days(by, folder):
+    """Two days of one recording; landmark 7 has been moved in between."""
+    world = StressWorld(
+        seed=1,
+        robots=2,
+        seconds=2.0 * MOVED_AT_S,
+        hidden=True,
+        moved=(MovedLandmark(7, by, MOVED_AT_S),),
+    )
+    scenario = final_only(scenario_in(write(world, folder)))
+    streams = streams_of(scenario)
+    begins_ns, ends_ns = zip(*streams.spans_ns.values(), strict=True)
+    middle_ns = round(MOVED_AT_S * 1e9)
+    first = part(streams, min(begins_ns), middle_ns, begins=True)
+    return scenario, first, part(streams, middle_ns, max(ends_ns), begins=False)
+
+
+@pytest.mark.parametrize("by", [(0.5, 0.0), (0.4, -0.3)])
+def test_a_landmark_that_association_takes_for_another_within_the_gate_has_moved(by, tmp_path):
+    """Its places are no pair of the association, or one submap has it at the former place."""
+    scenario, first, second = two_days(by, tmp_path)
+    _, centre, _ = day(1, scenario=scenario, streams=first)
+    saved = centre.maps.fold.save_map("site")
+    samples, centre, _ = day(1, [saved], scenario=scenario, streams=second)
+    fused = final_map(samples)
+    (found,) = (each for each in changed(fused).values() if each.state != "new")
+    assert found.state == "moved"
+    assert (np.abs([found.dx - by[0], found.dy - by[1]]) < 4.0 * found.sigma).all()
+    later = centre.maps.fold.save_map("later")
+    here = np.array(place_of(found.landmark, fused))
+    away = np.hypot(*(floats(later.means, "means").reshape(-1, 2) - here).T)
+    assert (away < 1.0).sum() == 1
 
 
 def test_the_commands_save_show_and_load_a_map(tmp_path):

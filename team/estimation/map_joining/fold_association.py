@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.closure import (
     patch_step,
     search_island,
     search_other_island,
 )
+from teamslam.team.estimation.association.gating import gate_pairs, list_pairs
 from teamslam.team.estimation.association.island_view import IslandView, ViewedSubmap
 from teamslam.team.estimation.association.joint_compatibility import MergedPairs
 from teamslam.team.estimation.association.landmark_sets import (
@@ -22,8 +24,15 @@ from teamslam.team.estimation.association.landmark_sets import (
 )
 from teamslam.team.estimation.association.member_log import LocalLandmark, MergeRecord
 from teamslam.team.estimation.association.verification import Closure, is_ambiguous
-from teamslam.team.estimation.contribution import Contribution, Stream, first_of
+from teamslam.team.estimation.contribution import (
+    Contribution,
+    Stream,
+    first_of,
+    is_absolute,
+    is_map,
+)
 from teamslam.team.estimation.gaussian import UNSOLVABLE
+from teamslam.team.estimation.map_joining.absence import absences
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     is_solvable,
@@ -39,7 +48,13 @@ from teamslam.team.estimation.map_joining.joining import (
 )
 from teamslam.team.estimation.map_joining.merging import Merge, place_island
 from teamslam.team.estimation.map_joining.minima import solve_minimum
-from teamslam.team.estimation.map_joining.saved_maps import SEQUENTIAL
+from teamslam.team.estimation.map_joining.saved_maps import (
+    FALSE_ALARM,
+    LEAST_SUBMAPS,
+    SEQUENTIAL,
+    maps_of,
+    separate,
+)
 from teamslam.team.estimation.map_joining.submap_graph import tie_landmarks
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Float
@@ -88,6 +103,69 @@ def view_island(island: Island, landmarks: Landmarks) -> IslandView:
         profile=island.settings.association,
         stamp_ns=max((each.contribution.end_ns for each in graph.submaps), default=0),
     )
+
+
+def recognise_moved(fold: Fold) -> Fold:
+    """Give unnamed landmarks that have moved since a saved map the number of their former place.
+
+    A landmark of the map that fewer than LEAST_SUBMAPS submaps of today observe, although more were
+    due (`absences`), and one of today that LEAST_SUBMAPS observe, are one if no other landmark of
+    either kind is within the gate of either: where all landmarks are known by their places, a
+    displacement within the gate is likelier than a loss and an arrival. The map's place becomes the
+    former one.
+    """
+    for key in sorted(fold.islands):
+        if fold.islands[key].graph.condensed is None:
+            fold = _recognise_in(fold, key)
+    return fold
+
+
+def _recognise_in(fold: Fold, key: Stream) -> Fold:
+    island = fold.islands[key]
+    maps = [each for each in maps_of(island.graph) if not is_absolute(each.contribution.stream)]
+    if not maps or not fold.has_unnamed:
+        return fold
+    view = view_island(island, fold.landmarks)
+    own = np.array([not is_map(each.observation.stream) for each in view.submaps], np.bool_)
+    today, judged = view.sees[own].sum(axis=0), fold.landmarks.judged()
+    free = np.array([id_ >= UNNAMED and id_ not in judged for id_ in view.ids], np.bool_)
+    saved = np.zeros(len(view.ids), np.bool_)
+    saved[view.saved] = True
+    old = np.flatnonzero(free & saved & (today < LEAST_SUBMAPS))
+    new = np.flatnonzero(free & ~saved & (today >= LEAST_SUBMAPS))
+    places = absences(island, view.joint.mean[old]) if len(old) and len(new) else []
+    old = old[np.array([each.chance < FALSE_ALARM for each in places], np.bool_)] if places else old
+    if not len(old) or not len(new):
+        return fold
+    one, two, sds = gate_pairs(view.joint, *list_pairs(new, old), view.profile)
+    for first, second, sd in zip(one.tolist(), two.tolist(), sds.tolist(), strict=True):
+        number, before = view.ids[first], view.ids[second]
+        of = [s.contribution.stream for s in maps if island.graph.landmarks[before] in s.landmarks]
+        if len(of) == 1 and (one == first).sum() == (two == second).sum() == 1:
+            tie = MergeRecord("near", before, 0.0, 0.0, sd, view.stamp_ns)
+            fold = _give_former_place(fold, key, of[0], number, tie)
+    return fold
+
+
+def _give_former_place(
+    fold: Fold, key: Stream, stream: Stream, number: int, tie: MergeRecord
+) -> Fold:
+    """Make a saved map's place of the landmark `tie.into` the former place of another landmark."""
+    island = fold.islands[key]
+    saved = next(each for each in maps_of(island.graph) if each.contribution.stream == stream)
+    place = int(island.graph.offset[island.graph.landmarks[number]])
+    apart = separate(island, saved, [tie.into])
+    if tie.into in apart.graph.landmarks:
+        at = int(apart.graph.offset[apart.graph.landmarks[tie.into]])
+        values = apart.state.copy()
+        values[at : at + 2] = values[place : place + 2]
+        apart = replace(apart, state=values)
+    landmarks, becomes = merge_sets(fold.landmarks, [(number, tie)])
+    graph, state = tie_landmarks(apart.graph, apart.state, becomes)
+    former = dict(graph.former)
+    former[stream, becomes.get(tie.into, tie.into)] = former.pop((stream, tie.into))
+    island = replace(apart, graph=replace(graph, former=former), state=state)
+    return replace(fold, islands={**fold.islands, key: island}, landmarks=landmarks)
 
 
 class _IslandViews:
