@@ -10,7 +10,7 @@ import pytest
 
 import teamslam
 from teamslam.team import library
-from teamslam.team.estimation.association.classes import CONTRADICTED, compare_classes
+from teamslam.team.estimation.association.gating import CONTRADICTED, compare_classes
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Outgoing, opened
 from teamslam.team.wire.zenoh.bus import ZenohBus

@@ -109,9 +109,7 @@ def _looks_of(found: Clusters) -> _WindowLooks:
     bearings = np.arctan2(scans.points[:, 1], scans.points[:, 0])
     counts = np.bincount(found.landmark_of, minlength=len(landmarks))
     real = counts >= LEAST_SEEN
-    bounds = scans.bounds
-    for k, pose in enumerate(found.window.poses):
-        rows = slice(bounds[k], bounds[k + 1])
+    for pose, rows in zip(found.window.poses, scans.rows, strict=True):
         own = found.landmark_of[rows]
         if not len(own):
             continue

@@ -17,8 +17,10 @@ from teamslam.team.core import inverse_matrix as inverse
 from teamslam.team.shapes import Float
 
 __all__ = [
+    "add_to_blocks",
     "cholesky",
     "congruent",
+    "diagonal_blocks",
     "forward",
     "inverse",
     "inverse_of_factored",
@@ -29,11 +31,26 @@ __all__ = [
 ]
 
 
-def congruent(A: Float[np.ndarray, "n k"], P: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "n n"]:
+def congruent(
+    A: Float[np.ndarray, "*a n k"], P: Float[np.ndarray, "*b k k"]
+) -> Float[np.ndarray, "*c n n"]:
     """Compute A P Aᵀ."""
-    return product(product(A, P), A.T)
+    return product(product(A, P), A.swapaxes(-1, -2))
 
 
 def quadratic(W: Float[np.ndarray, "n n"], x: Float[np.ndarray, " n"]) -> float:
     """Compute xᵀ W x."""
     return float(product(product(x, W), x))
+
+
+def diagonal_blocks(P: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "L 2 2"]:
+    """Return the 2 × 2 blocks on the diagonal."""
+    at = np.arange(len(P) // 2)
+    blocks: Float[np.ndarray, "L 2 2"] = P.reshape(len(at), 2, len(at), 2)[at, :, at]
+    return blocks
+
+
+def add_to_blocks(P: Float[np.ndarray, "n n"], blocks: Float[np.ndarray, "L 2 2"]) -> None:
+    """Add to the 2 × 2 blocks on the diagonal, in place."""
+    at = np.arange(len(blocks))
+    P.reshape(len(at), 2, len(at), 2)[at, :, at] += blocks

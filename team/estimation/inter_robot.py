@@ -19,7 +19,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream, named
 from teamslam.team.estimation.gaussian import information
 from teamslam.team.estimation.models import NEAREST_M, Increment, noise
-from teamslam.team.estimation.se2 import Pose, inverse, transformed, wrapped
+from teamslam.team.estimation.se2 import Pose, inverse, rotation, transformed, wrapped
 from teamslam.team.shapes import Float
 
 STATION_POSE = np.array([0.0, -1e5, 0.0])
@@ -76,7 +76,7 @@ def from_station(
     x, y = position - STATION_POSE[:2]
     distance = core.hypot(x, y)
     J = np.array([[x, y], [-y / distance, x / distance]]) / distance
-    spread = dense.product(dense.product(J, covariance), J.T)
+    spread = dense.congruent(J, covariance)
     return np.array([distance, core.atan2(y, x)]), 0.5 * (spread + spread.T)
 
 
@@ -95,27 +95,23 @@ def point_seen(sensor: Sensor, distance: float, bearing: float, drift: float) ->
     """
     range_variance, bearing_variance = noise(sensor, distance)
     own = core.squared(sensor.marker_sigma) + drift * drift
-    turn = _turn(bearing)
+    turn = rotation(bearing)
     spread = np.diag([range_variance + own, bearing_variance * core.squared(distance) + own])
-    return CarriedPoint(distance * turn[:, 0], dense.product(dense.product(turn, spread), turn.T))
+    return CarriedPoint(distance * turn[:, 0], dense.congruent(turn, spread))
 
 
 def of_base(seen: CarriedPoint, mount: Pose) -> CarriedPoint:
     """Transform a point from the sensor's frame to that of the base."""
-    turn = _turn(float(mount[2]))
-    return CarriedPoint(
-        transformed(mount, seen.point), dense.product(dense.product(turn, seen.covariance), turn.T)
-    )
+    turn = rotation(float(mount[2]))
+    return CarriedPoint(transformed(mount, seen.point), dense.congruent(turn, seen.covariance))
 
 
 def carry_back(seen: CarriedPoint, node_from_here: Increment) -> CarriedPoint:
     """Carry the point back to an earlier node."""
     T = node_from_here.mean
-    turn = _turn(float(T[2]))
+    turn = rotation(float(T[2]))
     J = dense.product(turn, np.array([[1.0, 0.0, -seen.point[1]], [0.0, 1.0, seen.point[0]]]))
-    spread = dense.product(dense.product(turn, seen.covariance), turn.T) + dense.product(
-        dense.product(J, node_from_here.covariance), J.T
-    )
+    spread = dense.congruent(turn, seen.covariance) + dense.congruent(J, node_from_here.covariance)
     return CarriedPoint(transformed(T, seen.point), spread)
 
 
@@ -123,17 +119,10 @@ def carry_on(seen: CarriedPoint, here_from_node: Increment) -> CarriedPoint:
     """Carry the point on to a later node."""
     T = inverse(here_from_node.mean)
     point = transformed(T, seen.point)
-    turn = _turn(float(T[2]))
+    turn = rotation(float(T[2]))
     J = np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]])
-    spread = dense.product(dense.product(turn, seen.covariance), turn.T) + dense.product(
-        dense.product(J, here_from_node.covariance), J.T
-    )
+    spread = dense.congruent(turn, seen.covariance) + dense.congruent(J, here_from_node.covariance)
     return CarriedPoint(point, spread)
-
-
-def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
-    s, c = core.sin_and_cos(angle)
-    return np.array([[c, -s], [s, c]])
 
 
 def reduced(
@@ -150,7 +139,7 @@ def reduced(
     for each, distance in zip(carried, ranges, strict=True):
         x, y = each.point / distance
         polar = np.array([[x, y], [-y / distance, x / distance]])
-        total += dense.product(dense.product(polar, each.covariance), polar.T)
+        total += dense.congruent(polar, each.covariance)
     bearing = wrapped(bearings[0] + float(np.median(offsets)))
     mean = total / len(carried)
     return np.array([float(np.median(ranges)), bearing]), 0.5 * (mean + mean.T)

@@ -32,4 +32,4 @@ def moved_by(pose: PoseGaussian, step: Pose) -> PoseGaussian:
     end = compose(pose.mean, step)
     dx, dy = end[:2] - pose.mean[:2]
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    return PoseGaussian(end, dense.product(dense.product(F, pose.covariance), F.T))
+    return PoseGaussian(end, dense.congruent(F, pose.covariance))

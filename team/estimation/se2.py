@@ -12,6 +12,7 @@ from teamslam.team.core import (
     exponential,
     inverse,
     logarithm,
+    sin_and_cos,
     tangent,
     transformed,
     wrapped,
@@ -27,6 +28,7 @@ __all__ = [
     "exponential",
     "inverse",
     "logarithm",
+    "rotation",
     "tangent",
     "transformed",
     "wrapped",
@@ -34,3 +36,9 @@ __all__ = [
 
 Pose = Float[np.ndarray, "3"]
 Point = Float[np.ndarray, "2"]
+
+
+def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
+    """Return the rotation matrix of an angle."""
+    s, c = sin_and_cos(angle)
+    return np.array([[c, -s], [s, c]])

@@ -14,8 +14,11 @@ from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
 from teamslam.team.config import GATE, UNNAMED, Sensor
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.association.gating import compute_mahalanobis, match_best_first
-from teamslam.team.estimation.association.scans import UNASSIGNED
+from teamslam.team.estimation.association.scans import (
+    UNASSIGNED,
+    compute_mahalanobis,
+    match_best_first,
+)
 from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Pose

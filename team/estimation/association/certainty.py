@@ -16,8 +16,12 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import AssociationSettings
-from teamslam.team.estimation.association.gating import compute_mahalanobis
-from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, predict_landmarks
+from teamslam.team.estimation.association.scans import (
+    UNASSIGNED,
+    Scans,
+    compute_mahalanobis,
+    predict_landmarks,
+)
 from teamslam.team.estimation.association.smoothing import SmoothedWindow
 from teamslam.team.shapes import Float, Int64
 
@@ -89,11 +93,9 @@ def association_probabilities(
     alone = landmark_of == UNASSIGNED
     alone |= counts[landmark_of] < settings.least_seen
     out = (1.0 + np.count_nonzero(alone)) / (view.looks * view.area)
-    bounds = scans.bounds
     found = np.zeros(len(landmark_of))
-    for k in range(len(window.poses)):
-        of_scan = np.arange(bounds[k], bounds[k + 1])
-        of_scan = of_scan[landmark_of[of_scan] != UNASSIGNED]
+    for k, rows in enumerate(scans.rows):
+        of_scan = rows.start + np.flatnonzero(landmark_of[rows] != UNASSIGNED)
         if not len(of_scan):
             continue
         seen, spread = predict_landmarks(

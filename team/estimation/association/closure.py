@@ -14,8 +14,12 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.association.classes import stack_classes
-from teamslam.team.estimation.association.gating import Indices, Joint, evaluate_pairs, list_pairs
+from teamslam.team.estimation.association.gating import (
+    Indices,
+    Joint,
+    list_pairs,
+    stack_classes,
+)
 from teamslam.team.estimation.association.island_view import (
     IslandView,
     join_indices,
@@ -48,7 +52,7 @@ from teamslam.team.estimation.association.voting import (
     propose_alignments,
 )
 from teamslam.team.estimation.contribution import Stream
-from teamslam.team.estimation.se2 import compose
+from teamslam.team.estimation.se2 import compose, rotation
 from teamslam.team.shapes import Float
 
 BEND = 8.0
@@ -71,14 +75,13 @@ NEARLY = 2.0
 class Side(NamedTuple):
     """Landmarks of one side: indices in the joint Gaussian, positions and spreads.
 
-    ids, within: indices in the caller's map and in the whole side. views: landmarks observed
-    together. parts: groups of neighbours.
+    ids: indices in the caller's map. views: landmarks observed together. parts: groups of
+    neighbours.
     """
 
     at: Indices
     points: PointSet
     ids: Indices
-    within: Indices
     views: Views
     parts: tuple[Indices, ...] = ()
 
@@ -105,8 +108,10 @@ class Placement(NamedTuple):
         return [(pair.first, of[pair.second]) for pair in self.merged.pairs]
 
 
-JointOf = Callable[[Vote], tuple[Joint, Side]]
-"""Return the joint Gaussian of both sides for a proposed alignment, and the target's part in it."""
+JointOf = Callable[[Vote], tuple[Joint, Side, Vote]]
+"""Return the joint Gaussian of both sides for a proposed alignment, the target's part in it, and
+the alignment with the part's indices.
+"""
 
 
 def align(
@@ -133,8 +138,8 @@ def align(
         if is_own and _is_identity(patch.ids[vote.first], target.ids[vote.second]):
             most = max(most, len(vote.first))
             continue
-        joint, part = joint_of(vote)
-        merged = _grow_alignment(patch, part, joint, vote, profile)
+        joint, part, vote = joint_of(vote)
+        merged = _grow_alignment(patch, part, joint, vote)
         if merged is not None:
             absent, surely = _count_absent(merged, patch, part, profile)
             found.append(
@@ -213,14 +218,11 @@ def _estimate_evidence(vote: Vote, patch: Side, target: Side, profile: Associati
 def _count_absent(
     merged: Alignment, patch: Side, target: Side, profile: AssociationProfile
 ) -> tuple[int, int]:
-    mean = merged.mean
-    place = np.full(int(max(target.views.max(initial=-1), target.within.max())) + 1, -1)
-    place[target.within] = np.arange(len(target.within))
     first, second = np.array([(pair.first, pair.second) for pair in merged.pairs]).T
     return _count_missing(
-        (mean[patch.at], np.flatnonzero(np.isin(patch.at, first))),
-        (mean[target.at], np.flatnonzero(np.isin(target.at, second))),
-        (patch.views, renumber_views(target.views, place)),
+        (merged.mean[patch.at], np.flatnonzero(np.isin(patch.at, first))),
+        (merged.mean[target.at], np.flatnonzero(np.isin(target.at, second))),
+        (patch.views, target.views),
         profile,
     )
 
@@ -249,36 +251,31 @@ def _count_missing(
     return count, surely
 
 
-def combine_maps(
-    patch: Joint, target: Joint, side: Side, vote: Vote, profile: AssociationProfile
-) -> tuple[Joint, Side]:
-    """Combine two maps in the target's frame; return the joint map and the target's part near the
-    patch.
+def combine_maps(patch: Joint, target: Joint, side: Side, vote: Vote) -> tuple[Joint, Side, Vote]:
+    """Combine two maps in the target's frame: the joint map of the patch and the target near it.
 
     The motion is N(voted, diag(extent², extent², π²)) about the patch's centroid, with the larger
     map's extent.
     """
     n = len(patch.mean)
     extent = float(max(np.ptp(each.mean, axis=0).max() for each in (patch, target)))
-    local = patch.mean - patch.mean.mean(axis=0)
-    placed = apply_motion(vote.motion, local)
+    placed = apply_motion(vote.motion, patch.mean - patch.mean.mean(axis=0))
     away = core.hypot(*(placed[:, None] - target.mean[None]).transpose(2, 0, 1))
-    near = away.min(axis=0) < BEND * profile.same
+    near = away.min(axis=0) < BEND * patch.profile.same
     near[vote.second] = True
     nearby = np.flatnonzero(near)
     target = target.select(nearby)
     m = len(nearby)
-    s, c = core.sin_and_cos(vote.motion[2])
-    R = np.kron(np.eye(n), np.array([[c, -s], [s, c]]))
+    R = np.kron(np.eye(n), rotation(vote.motion[2]))
     lever = placed - vote.motion[:2]
     J = np.zeros((2 * n, 3))
     J[0::2, 0] = J[1::2, 1] = 1.0
     J[0::2, 2], J[1::2, 2] = -lever[:, 1], lever[:, 0]
     covariance = np.zeros((2 * (n + m), 2 * (n + m)))
-    spread = np.array([core.squared(extent), core.squared(extent), core.squared(np.pi)])
-    covariance[: 2 * n, : 2 * n] = dense.product(
-        dense.product(R, patch.covariance), R.T
-    ) + dense.product(J * spread, J.T)
+    spread = core.squared(np.array([extent, extent, np.pi]))
+    covariance[: 2 * n, : 2 * n] = dense.congruent(R, patch.covariance) + dense.product(
+        J * spread, J.T
+    )
     covariance[2 * n :, 2 * n :] = target.covariance
     apart = np.zeros((n + m, n + m), np.bool_)
     apart[:n, :n], apart[n:, n:] = patch.apart, target.apart
@@ -286,30 +283,35 @@ def combine_maps(
         np.concatenate([placed, target.mean]),
         covariance,
         apart,
+        patch.profile,
         target.density,
         classes=stack_classes([(n, patch.classes), (m, target.classes)]),
     )
-    return both, Side(n + np.arange(m), side.points, side.ids[nearby], nearby, side.views)
+    place = np.full(len(near), -1)
+    place[nearby] = np.arange(m)
+    part = Side(
+        n + np.arange(m),
+        side.points.select(nearby),
+        side.ids[nearby],
+        renumber_views(side.views, place),
+    )
+    return both, part, vote._replace(second=place[vote.second])
 
 
-def _grow_alignment(
-    patch: Side, target: Side, joint: Joint, vote: Vote, profile: AssociationProfile
-) -> Alignment | None:
-    place = dict(zip(target.within.tolist(), target.at.tolist(), strict=True))
-    first = patch.at[vote.first]
-    second = np.array([place[k] for k in vote.second.tolist()], np.int64)
+def _grow_alignment(patch: Side, target: Side, joint: Joint, vote: Vote) -> Alignment | None:
+    first, second = patch.at[vote.first], target.at[vote.second]
     candidates = list_pairs(patch.at, target.at)
     points = patch.points.mean[vote.first]
     i, j = np.triu_indices(len(points), 1)
     far = np.argsort(-core.hypot(*(points[i] - points[j]).T), kind="stable")
     used: set[int] = set()
     best: Alignment | None = None
-    for k in far:
-        if {int(i[k]), int(j[k])} & used:
+    for ends in np.column_stack((i, j))[far].tolist():
+        if used.intersection(ends):
             continue
-        used |= {int(i[k]), int(j[k])}
-        seeds = [(int(first[at]), int(second[at])) for at in (i[k], j[k])]
-        found = grow_alignment(joint, candidates, seeds, profile, profile.near)
+        used.update(ends)
+        seeds = [(int(first[at]), int(second[at])) for at in ends]
+        found = grow_alignment(joint, candidates, seeds, joint.profile.near)
         if found is not None and (best is None or found.llr > best.llr):
             best = found
         if len(used) >= 2 * SEEDS or (best is not None and len(best.pairs) >= len(first)):
@@ -340,7 +342,7 @@ def search_island(view: IslandView, stream: Stream, last: int) -> Closure | None
     return find_closure(
         _make_patch(view, patch, submaps),
         side,
-        lambda _: (view.joint, side),
+        lambda vote: (view.joint, side, vote),
         profile,
         ClosureTests(profile.closure_pairs, profile.closure_llr),
     )
@@ -366,7 +368,7 @@ def search_other_island(
     def target_of(view: IslandView) -> tuple[Side, JointOf]:
         at = np.flatnonzero(~view.missed)
         side, joint = _make_side(view, at, range(len(view.seen_by))), view.joint.select(at)
-        return side, lambda vote: combine_maps(own, joint, side, vote, profile)
+        return side, lambda vote: combine_maps(own, joint, side, vote)
 
     def aliases() -> list[Placement]:
         return align(of_patch, *target_of(mine), profile, profile.island_pairs, is_own=True)
@@ -430,8 +432,8 @@ def assign_nearby(view: IslandView, submaps: Sequence[int]) -> Closure | None:
     target = np.flatnonzero(others.any(axis=0))
     for k in reversed(submaps):
         own = np.intersect1d(view.submaps[k].unnamed, patch)
-        for candidates in select_comparisons(view.joint, own, others, profile, most_sd):
-            found = assign_jointly(view.joint, *list_pairs(own, candidates), profile, most_sd)
+        for candidates in select_comparisons(view.joint, own, others, most_sd):
+            found = assign_jointly(view.joint, *list_pairs(own, candidates), most_sd)
             sd = max((pair.sd for pair in found.pairs), default=0.0)
             if len(found.pairs) < SURE_AFTER or sd <= profile.near:
                 continue
@@ -460,7 +462,7 @@ def _find_reachable(view: IslandView, patch: Indices) -> Indices:
     """Find the landmarks that may coincide with the patch's; none if all are certain."""
     others = np.setdiff1d(np.flatnonzero(~view.missed), patch)
     one, two = list_pairs(patch, others)
-    at = evaluate_pairs(view.joint, one, two, view.profile)
+    at = view.joint.evaluate(one, two)
     fits = at.chi2 < view.profile.gate
     if not (fits & (at.sd > view.profile.near)).any():
         return others[:0]
@@ -468,8 +470,7 @@ def _find_reachable(view: IslandView, patch: Indices) -> Indices:
 
 
 def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
-    n = len(view.ids)
-    own = view.joint.covariance.reshape(n, 2, n, 2)[at, :, at]
+    own = dense.diagonal_blocks(view.joint.covariance)[at]
     sd = np.sqrt(np.maximum(own[:, 0, 0] + own[:, 1, 1], 0.0))
     classes = view.joint.classes
     points = PointSet(
@@ -477,10 +478,10 @@ def _make_side(view: IslandView, at: Indices, submaps: Sequence[int]) -> Side:
         np.minimum(sd, view.profile.tight),
         None if classes is None else classes[at],
     )
-    place = np.full(n, -1)
+    place = np.full(len(view.ids), -1)
     place[at] = np.arange(len(at))
     seen = pad_views(each for k in submaps for each in view.submaps[k].views)
-    return Side(at, points, at, np.arange(len(at)), renumber_views(seen, place))
+    return Side(at, points, at, renumber_views(seen, place))
 
 
 def _make_patch(view: IslandView, patch: Indices, submaps: Sequence[int]) -> Side:

@@ -11,16 +11,17 @@ from teamslam.team import core
 from teamslam.team.config import AssociationSettings
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.association.certainty import association_probabilities
-from teamslam.team.estimation.association.gating import compute_mahalanobis, match_scan
 from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
     Scans,
+    compute_mahalanobis,
     initialise_landmark,
+    match_scan,
     predict_landmarks,
-    rotation,
 )
 from teamslam.team.estimation.association.smoothing import SmoothedWindow, smooth_window
 from teamslam.team.estimation.association.tracking import Slip, slip_covariance, track_window
+from teamslam.team.estimation.se2 import rotation
 from teamslam.team.shapes import Bool, Float, Int64
 
 RARE = 0.05  # odds of a landmark below which its detections are clutter
@@ -139,21 +140,19 @@ def _associate_again(
     P[:n, :n] = window.covariance
     known = list(names)
     points = np.concatenate((window.landmarks, np.empty((len(scans.points), 2))))
-    landmark_of, bounds = np.full(len(scans.points), UNASSIGNED), scans.bounds
-    for i in range(k):
-        of_scan = slice(bounds[i], bounds[i + 1])
-        at, R, named = scans.points[of_scan], scans.covariances[of_scan], scans.names[of_scan]
-        if not len(at):
+    landmark_of = np.full(len(scans.points), UNASSIGNED)
+    for i, pose in enumerate(window.poses):
+        scan = scans.detections(i)
+        if not len(scan.points):
             continue
-        pose = window.poses[i]
         predicted = predict_landmarks(pose, points[: len(known)], P, 3 * i, 3 * k)
-        found = match_scan(at, R, named, predicted, np.array(known), settings)
+        found = match_scan(scan, predicted, np.array(known), settings)
         for row in np.nonzero(found == UNASSIGNED)[0]:
-            end = 3 * k + 2 * len(known)
-            points[len(known)] = initialise_landmark(pose, at[row], R[row], P, 3 * i, end)
+            at, R, end = scan.points[row], scan.covariances[row], 3 * k + 2 * len(known)
+            points[len(known)] = initialise_landmark(pose, at, R, P, 3 * i, end)
             found[row] = len(known)
-            known.append(named[row])
-        landmark_of[of_scan] = found
+            known.append(scan.names[row])
+        landmark_of[scans.rows[i]] = found
     return _renumber(landmark_of, np.array(known, np.int64), points[: len(known)])
 
 
@@ -209,9 +208,7 @@ def _mark_looks(scans: Scans, window: SmoothedWindow) -> Bool[np.ndarray, "L K"]
     looks = np.zeros((len(window.landmarks), len(window.poses)), np.bool_)
     bearings = core.atan2(scans.points[:, 1], scans.points[:, 0])
     ranges = core.hypot(scans.points[:, 0], scans.points[:, 1])
-    bounds = scans.bounds
-    for k, pose in enumerate(window.poses):
-        own = slice(bounds[k], bounds[k + 1])
+    for k, (pose, own) in enumerate(zip(window.poses, scans.rows, strict=True)):
         if own.start == own.stop:
             continue
         x, y = dense.product(window.landmarks - pose[:2], rotation(pose[2])).T

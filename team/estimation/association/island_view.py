@@ -16,20 +16,19 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.association.classes import Classes, stack_classes
-from teamslam.team.estimation.association.density import LandmarkDensity
 from teamslam.team.estimation.association.gating import (
+    Classes,
     Indices,
     Joint,
+    LandmarkDensity,
     Pair,
-    gate_pairs,
     list_pairs,
+    stack_classes,
 )
 from teamslam.team.estimation.association.joint_compatibility import (
     MOST_ASSIGNED,
     MergedPairs,
     assign_jointly,
-    condition_on_pair,
     grow_pairs,
 )
 from teamslam.team.estimation.association.landmark_sets import Landmarks
@@ -127,6 +126,7 @@ class IslandView:
             mean,
             covariance,
             self._mark_apart(pairs[distinct]),
+            self.profile,
             density,
             miss_probabilities(mean, self.seen_by, self.profile.same),
             self._mark_apart_in_window(pairs),
@@ -226,9 +226,8 @@ class IslandView:
             apart = ({int(into[a]), int(into[b])} for a, b, one_ in declared if not one_)
             if not same or one == two or {one, two} in apart:
                 continue
-            joint = condition_on_pair(self.joint, one, two, self.profile)
             pair = Pair(one, two, np.inf, 0.0, -np.inf)
-            self.record_merges(MergedPairs((pair,), joint), "verdict")
+            self.record_merges(MergedPairs((pair,), self.joint.condition(one, two)), "verdict")
 
     def track(self, k: int) -> None:
         """Merge landmarks of submap k with the same robot's earlier ones, then with all nearby
@@ -247,15 +246,9 @@ class IslandView:
         first, second = first[~self.merged[first]], second[~self.merged[second]]
         if not len(first) or not len(second):
             return
-        found = grow_pairs(
-            self.joint,
-            list_pairs(first, second),
-            self.profile,
-            most_sd=most_sd,
-            sure_sd=self.profile.near,
-        )
-        if found.pairs:
-            self.record_merges(found, kind)
+        pairs = list_pairs(first, second)
+        found = grow_pairs(self.joint, pairs, most_sd=most_sd, sure_sd=self.profile.near)
+        self.record_merges(found, kind)
 
     def compare(self, k: int) -> None:
         """Merge pairs of submap k with each other submap on which all likely assignments agree."""
@@ -263,10 +256,9 @@ class IslandView:
         others = self.sees.copy()
         others[k] = False
         near = self.profile.near
-        for nearby in select_comparisons(self.joint, own, others, self.profile, near):
-            first, second = list_pairs(own[~self.merged[own]], self._resolve(nearby))
-            found = assign_jointly(self.joint, first, second, self.profile, near)
-            self.record_merges(found, "near")
+        for nearby in select_comparisons(self.joint, own, others, near):
+            pairs = list_pairs(own[~self.merged[own]], self._resolve(nearby))
+            self.record_merges(assign_jointly(self.joint, *pairs, near), "near")
 
     def compare_again(self, fresh: Sequence[int], turn: int) -> None:
         """Compare older undecided submaps near the tick's (`fresh`).
@@ -280,7 +272,7 @@ class IslandView:
         away = np.abs(mean[:, None] - mean[near][None]).max(axis=2).min(axis=1)
         around = np.flatnonzero((away < REEXAMINED_WITHIN * self.profile.same) & ~self.merged)
         undecided = np.zeros(len(self.ids), np.bool_)
-        undecided[find_undecided(self.joint, around, self.profile)] = True
+        undecided[find_undecided(self.joint, around)] = True
         found = np.setdiff1d(np.flatnonzero(self.sees[:, undecided].any(axis=1)), fresh)
         for k in select_by_turns(found.tolist(), turn):
             self.compare(k)
@@ -298,13 +290,11 @@ class IslandView:
         one, two = at[later], at[earlier]
         x, y = (self.joint.mean[one] - self.joint.mean[two]).T
         close = core.hypot(x, y) < self.profile.same
-        one, two, _ = gate_pairs(
-            self.joint, one[close], two[close], self.profile, self.profile.tight
-        )
+        one, two, _ = self.joint.gate(one[close], two[close], self.profile.tight)
         split = np.unique(one)
         for begin in range(0, len(split), MOST_ASSIGNED):
             own = np.isin(one, split[begin : begin + MOST_ASSIGNED]) & ~self.merged[two]
-            found = assign_jointly(self.joint, one[own], two[own], self.profile, self.profile.tight)
+            found = assign_jointly(self.joint, one[own], two[own], self.profile.tight)
             self.record_merges(found, "sweep")
 
 
@@ -315,11 +305,7 @@ def join_indices(of: Iterable[Indices]) -> Int64[np.ndarray, " _"]:
 
 
 def select_comparisons(
-    joint: Joint,
-    own: Indices,
-    sees: Bool[np.ndarray, "K n"],
-    profile: AssociationProfile,
-    most_sd: float,
+    joint: Joint, own: Indices, sees: Bool[np.ndarray, "K n"], most_sd: float
 ) -> list[Indices]:
     """Select the landmarks that `own` may be, for each submap worth a comparison.
 
@@ -328,7 +314,7 @@ def select_comparisons(
     deviation of a pair's difference.
     """
     others = np.setdiff1d(np.flatnonzero(sees.any(axis=0)), own)
-    one, two, _ = gate_pairs(joint, *list_pairs(own, others), profile, most_sd)
+    one, two, _ = joint.gate(*list_pairs(own, others), most_sd)
     if not len(one):
         return []
     fits = np.zeros((len(own), len(joint.mean)), np.bool_)
@@ -348,10 +334,10 @@ def select_comparisons(
     return found
 
 
-def find_undecided(joint: Joint, around: Indices, profile: AssociationProfile) -> Indices:
+def find_undecided(joint: Joint, around: Indices) -> Indices:
     """Find the landmarks that may be one with another of them."""
     one, two = (around[each] for each in np.triu_indices(len(around), 1))
-    one, two, _ = gate_pairs(joint, one, two, profile, profile.near)
+    one, two, _ = joint.gate(one, two, joint.profile.near)
     return np.unique(np.concatenate([one, two]))
 
 

@@ -1,14 +1,33 @@
-"""A window's detections as arrays, and its geometry on many poses and points at once."""
+"""A window's detections as arrays, their geometry, and their gates against landmarks."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.config import AssociationSettings
 from teamslam.team.estimation import dense
-from teamslam.team.shapes import Float, Int64
+from teamslam.team.estimation.se2 import rotation
+from teamslam.team.shapes import Bool, Float, Int64
 
 UNASSIGNED = -1  # no identity, or no landmark
+LEAST_DETERMINANT = 1e-32
+"""Lower bound of |S| [m⁴]: the smallest accepted standard deviation is 1e-8 m."""
+
+
+class Detections(NamedTuple):
+    """Detections of a keyframe in the robot's frame [m, m²]; names: identities, or UNASSIGNED."""
+
+    points: Float[np.ndarray, "n 2"]
+    covariances: Float[np.ndarray, "n 2 2"]
+    names: Int64[np.ndarray, " n"]
+
+    def select(self, rows: Int64[np.ndarray, " k"]) -> "Detections":
+        """Select some of the detections."""
+        return Detections(self.points[rows], self.covariances[rows], self.names[rows])
 
 
 @dataclass(frozen=True)
@@ -28,10 +47,16 @@ class Scans:
     covariances: Float[np.ndarray, "N 2 2"]
     names: Int64[np.ndarray, " N"]
 
-    @property
-    def bounds(self) -> Int64[np.ndarray, " bounds"]:
-        """Detections bounds[k] to bounds[k + 1] are of keyframe k."""
-        return np.searchsorted(self.keyframes, np.arange(len(self.motions) + 1))
+    @cached_property
+    def rows(self) -> list[slice]:
+        """Detections of each keyframe."""
+        bounds = np.searchsorted(self.keyframes, np.arange(len(self.motions) + 1)).tolist()
+        return [slice(*each) for each in pairwise(bounds)]
+
+    def detections(self, k: int) -> Detections:
+        """Return the detections of keyframe k."""
+        own = self.rows[k]
+        return Detections(self.points[own], self.covariances[own], self.names[own])
 
 
 def points_of(
@@ -43,15 +68,7 @@ def points_of(
     s, c = core.sin_and_cos(bearings)
     J = np.stack((np.stack((c, -ranges * s), -1), np.stack((s, ranges * c), -1)), -2)
     R = variances[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-    return np.column_stack((ranges * c, ranges * s)), dense.product(
-        dense.product(J, R), J.transpose(0, 2, 1)
-    )
-
-
-def rotation(angle: float) -> Float[np.ndarray, "2 2"]:
-    """Return the rotation matrix of an angle."""
-    s, c = core.sin_and_cos(angle)
-    return np.array([[c, -s], [s, c]])
+    return np.column_stack((ranges * c, ranges * s)), dense.congruent(J, R)
 
 
 def rotations(angles: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2 2"]:
@@ -92,12 +109,11 @@ def predict_landmarks(
     seen = dense.product(landmarks - pose[:2], turn)
     Hp = pose_jacobians(seen)
     rows = slice(first, first + 2 * count)
-    own = P[rows, rows].reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    own = dense.diagonal_blocks(P[rows, rows])
     cross = P[own_pose, rows].reshape(3, count, 2).transpose(1, 0, 2)
     mixed = dense.product(dense.product(Hp, cross), turn)
-    S = dense.product(dense.product(Hp, P[own_pose, own_pose]), Hp.transpose(0, 2, 1))
-    S = S + dense.product(dense.product(turn.T, own), turn) + mixed + mixed.transpose(0, 2, 1)
-    return seen, S
+    S = dense.congruent(Hp, P[own_pose, own_pose]) + dense.congruent(turn.T, own)
+    return seen, S + mixed + mixed.transpose(0, 2, 1)
 
 
 def initialise_landmark(
@@ -117,7 +133,51 @@ def initialise_landmark(
     G = dense.product(turn, np.array([[1.0, 0.0, -point[1]], [0.0, 1.0, point[0]]]))
     P[new, :end] = dense.product(G, P[own_pose, :end])
     P[:end, new] = P[new, :end].T
-    P[new, new] = dense.product(dense.product(G, P[own_pose, own_pose]), G.T) + dense.product(
-        dense.product(turn, covariance), turn.T
-    )
+    P[new, new] = dense.congruent(G, P[own_pose, own_pose]) + dense.congruent(turn, covariance)
     return np.asarray(pose[:2] + dense.product(turn, point))
+
+
+def compute_mahalanobis(
+    differences: Float[np.ndarray, "*n 2"], covariances: Float[np.ndarray, "*n 2 2"]
+) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
+    """Compute dᵀS⁻¹d and |S| of each difference d."""
+    a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    x, y = differences[..., 0], differences[..., 1]
+    determinants = np.maximum(a * c - b * b, LEAST_DETERMINANT)
+    return (c * x * x - 2.0 * b * x * y + a * y * y) / determinants, determinants
+
+
+def match_scan(
+    scan: Detections,
+    predicted: tuple[Float[np.ndarray, "L 2"], Float[np.ndarray, "L 2 2"]],
+    mapped_names: Int64[np.ndarray, " L"],
+    settings: AssociationSettings,
+) -> Int64[np.ndarray, " n"]:
+    """Match the detections of a scan with landmarks; UNASSIGNED without a match.
+
+    An unnamed detection matches unnamed landmarks in its gate, χ² of two degrees of freedom; a
+    named one its landmark at any distance. A pair costs dᵀS⁻¹d + ln|S|.
+    """
+    seen, spread = predicted
+    S = spread[None] + settings.variance_factor * scan.covariances[:, None]
+    squared, determinants = compute_mahalanobis(scan.points[:, None] - seen[None], S)
+    allowed = scan.names[:, None] == mapped_names[None]
+    allowed &= (squared < settings.gate) | (scan.names[:, None] != UNASSIGNED)
+    return match_best_first(allowed, squared + core.log(determinants))
+
+
+def match_best_first(
+    allowed: Bool[np.ndarray, "n L"], costs: Float[np.ndarray, "n L"]
+) -> Int64[np.ndarray, " n"]:
+    """Assign a landmark to each detection, the allowed pair of least cost first, or UNASSIGNED.
+
+    Equal costs keep their order.
+    """
+    found = np.full(len(allowed), UNASSIGNED)
+    rows, columns = np.nonzero(allowed)
+    assigned = np.zeros(allowed.shape[1], np.bool_)
+    for index in np.argsort(costs[rows, columns], kind="stable"):
+        row, column = rows[index], columns[index]
+        if found[row] == UNASSIGNED and not assigned[column]:
+            found[row], assigned[column] = column, True
+    return found

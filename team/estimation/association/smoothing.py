@@ -70,8 +70,7 @@ def _add_single(
     A.reshape(m, 2, n)[at[:, None], :, columns] = by_pose.transpose(0, 2, 1)
     AP = dense.product(A, found.covariance)
     own = dense.product(AP, A.T)
-    R = dense.product(dense.product(turn, scans.covariances[rows]), turn.transpose(0, 2, 1))
-    own.reshape(m, 2, m, 2)[at, :, at] += R
+    dense.add_to_blocks(own, dense.congruent(turn, scans.covariances[rows]))
     landmarks = np.empty((len(again), 2))
     landmarks[again] = found.landmarks
     landmarks[~again] = found.poses[of, :2] + np.einsum("nij,nj->ni", turn, scans.points[rows])

@@ -12,21 +12,19 @@ import numpy as np
 from teamslam.team import core
 from teamslam.team.config import AssociationSettings
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.association.gating import (
-    compute_mahalanobis,
-    match_best_first,
-    match_scan,
-)
 from teamslam.team.estimation.association.scans import (
     UNASSIGNED,
+    Detections,
     Scans,
+    compute_mahalanobis,
     initialise_landmark,
+    match_best_first,
+    match_scan,
     pose_jacobians,
     predict_landmarks,
-    rotation,
 )
 from teamslam.team.estimation.consistency import chi2_limit
-from teamslam.team.estimation.se2 import adjoint, compose, inverse
+from teamslam.team.estimation.se2 import adjoint, compose, inverse, rotation
 from teamslam.team.shapes import Float, Int64
 
 FEW = 0.5  # share of matched detections in a scan below which a slip is suspected
@@ -93,85 +91,68 @@ class Tracker:
         self.pose = compose(self.pose, by)
         self._P[:3, :3] += slip_covariance(by)
 
-    def update(
-        self,
-        landmarks: Int64[np.ndarray, " m"],
-        points: Float[np.ndarray, "m 2"],
-        covariances: Float[np.ndarray, "m 2 2"],
-    ) -> None:
+    def update(self, landmarks: Int64[np.ndarray, " m"], scan: Detections) -> None:
         """Update the state jointly by the detections of these landmarks."""
-        m, n = len(landmarks), self._size
-        if not m:
+        if not len(landmarks):
             return
-        H, seen = self._linearise(landmarks)
-        P = self._P[:n, :n]
-        HP = dense.product(H, P)
-        S = dense.product(HP, H.T)
-        S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
+        HP, S, error = self._predict(landmarks, scan)
         gain = dense.solve(S, HP).T
-        step = dense.product(gain, (points - seen).ravel())
+        step = dense.product(gain, error)
+        P = self._P[: len(gain), : len(gain)]
         P -= dense.product(gain, HP)
         np.multiply(P + P.T, 0.5, out=P)
         self.pose = compose(self.pose, step[:3])
         self._points[: len(self.names)] += step[3:].reshape(-1, 2)
 
-    def _linearise(
-        self, landmarks: Int64[np.ndarray, " m"]
-    ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "m 2"]]:
-        m = len(landmarks)
+    def _predict(
+        self, landmarks: Int64[np.ndarray, " m"], scan: Detections
+    ) -> tuple[Float[np.ndarray, "_ n"], Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
+        """Return H P, S = H P Hᵀ + R and the innovation of the detections of these landmarks."""
+        m, n = len(landmarks), self._size
         turn = rotation(self.pose[2])
         seen = dense.product(self.landmarks[landmarks] - self.pose[:2], turn)
-        H = np.zeros((m, 2, self._size))
+        H = np.zeros((m, 2, n))
         H[:, :, :3] = pose_jacobians(seen)
         columns = 3 + 2 * landmarks[:, None] + np.arange(2)
         H[np.arange(m)[:, None, None], np.arange(2)[:, None], columns[:, None, :]] = turn.T
-        return H.reshape(2 * m, -1), seen
+        rows = H.reshape(2 * m, n)
+        HP = dense.product(rows, self._P[:n, :n])
+        S = dense.product(HP, rows.T)
+        dense.add_to_blocks(S, scan.covariances)
+        return HP, S, (scan.points - seen).ravel()
 
-    def add_landmark(
-        self, point: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"], name: int
-    ) -> int:
+    def add_landmark(self, scan: Detections, row: int) -> int:
         """Add a landmark from a detection; return its index."""
         index = len(self.names)
-        at = initialise_landmark(self.pose, point, covariance, self._P, 0, self._size)
-        self._points[index] = at
-        self.names.append(name)
+        self._points[index] = initialise_landmark(
+            self.pose, scan.points[row], scan.covariances[row], self._P, 0, self._size
+        )
+        self.names.append(int(scan.names[row]))
         return index
 
-    def match_scan(
-        self,
-        points: Float[np.ndarray, "n 2"],
-        covariances: Float[np.ndarray, "n 2 2"],
-        names: Int64[np.ndarray, " n"],
-    ) -> Int64[np.ndarray, " n"]:
+    def match_scan(self, scan: Detections) -> Int64[np.ndarray, " n"]:
         """Match the detections of a scan; UNASSIGNED without a match."""
-        if not len(points) or not self.names:
-            return np.full(len(points), UNASSIGNED)
-        predicted = self.predict_landmarks()
-        return match_scan(
-            points, covariances, names, predicted, np.array(self.names), self._settings
-        )
+        if not len(scan.points) or not self.names:
+            return np.full(len(scan.points), UNASSIGNED)
+        return match_scan(scan, self.predict_landmarks(), np.array(self.names), self._settings)
 
-    def joint_distance_ratio(
-        self,
-        landmarks: Int64[np.ndarray, " m"],
-        points: Float[np.ndarray, "m 2"],
-        covariances: Float[np.ndarray, "m 2 2"],
-    ) -> float:
-        """Compute the joint squared Mahalanobis distance of these pairs over its limit (RARE)."""
-        m, n = len(landmarks), self._size
-        if not m:
-            return 0.0
-        H, seen = self._linearise(landmarks)
-        S = dense.product(dense.product(H, self._P[:n, :n]), H.T)
-        S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances
-        error = (points - seen).ravel()
-        return float(dense.product(error, dense.solve(S, error)) / chi2_limit(2 * m, RARE))
+    def is_slip_suspected(self, scan: Detections, found: Int64[np.ndarray, " n"]) -> bool:
+        """Return whether few match, one lacks a near match, or all fit badly together."""
+        known = np.nonzero(found != UNASSIGNED)[0]
+        if min(len(scan.points), len(self.names)) < SLIP_DETECTIONS:
+            return False
+        if len(known) < FEW * len(scan.points):
+            return True
+        free = np.delete(self.predict_landmarks()[0], found[known], axis=0)
+        offsets = scan.points[found == UNASSIGNED][:, None] - free[None]
+        if (core.hypot(offsets[..., 0], offsets[..., 1]) < self._settings.slip_m).any():
+            return True
+        _, S, error = self._predict(found[known], scan.select(known))
+        squared = float(dense.product(error, dense.solve(S, error)))
+        return squared > chi2_limit(2 * len(known), RARE)
 
     def find_slip(
-        self,
-        points: Float[np.ndarray, "n 2"],
-        covariances: Float[np.ndarray, "n 2 2"],
-        found: Int64[np.ndarray, " n"],
+        self, scan: Detections, found: Int64[np.ndarray, " n"]
     ) -> Float[np.ndarray, "3"] | None:
         """Find the slip (forward, left, turn) that explains most of a scan, or None.
 
@@ -180,20 +161,13 @@ class Tracker:
         pair.
         """
         gate, reach = self._settings.gate, self._settings.slip_m
+        points, covariances = scan.points, scan.covariances
         seen, spread = self.predict_landmarks()
         Hp = pose_jacobians(seen)
-        loose = np.diag(
-            [
-                core.squared(0.5 * reach),
-                core.squared(0.5 * reach),
-                core.squared(SLIP_TURN),
-            ]
-        )
+        loose = np.diag(core.squared(np.array([0.5 * reach, 0.5 * reach, SLIP_TURN])))
         tight = self._P[:3, :3]
-        own = spread - dense.product(dense.product(Hp, tight), Hp.transpose(0, 2, 1))
-        own += 1e-6 * np.eye(2) + np.maximum(
-            -_smaller_eigenvalue(own)[:, None, None], 0.0
-        ) * np.eye(2)
+        own = spread - dense.congruent(Hp, tight)
+        own += (1e-6 + np.maximum(-_smaller_eigenvalue(own), 0.0))[:, None, None] * np.eye(2)
         HpD = dense.product(Hp, loose + tight)
         offsets = points[:, None] - seen[None]
         near = core.hypot(offsets[..., 0], offsets[..., 1]) < reach
@@ -216,8 +190,7 @@ class Tracker:
             squared, determinants = compute_mahalanobis(
                 offsets_after, S[None] + covariances[:, None]
             )
-            costs = squared + core.log(determinants)
-            pairs = match_best_first(squared < gate, costs)
+            pairs = match_best_first(squared < gate, squared + core.log(determinants))
             rows = np.nonzero(pairs != UNASSIGNED)[0]
             figure = float(len(rows)), -float(squared[rows, pairs[rows]].sum())
             if figure > best and gate * (len(points) - len(rows)) - figure[1] < most:
@@ -226,9 +199,8 @@ class Tracker:
             return None
         rows, columns = slip
         H = Hp[columns].reshape(-1, 3)
-        S = dense.product(dense.product(H, loose + tight), H.T)
-        m = len(rows)
-        S.reshape(m, 2, m, 2)[np.arange(m), :, np.arange(m)] += covariances[rows] + own[columns]
+        S = dense.congruent(H, loose + tight)
+        dense.add_to_blocks(S, covariances[rows] + own[columns])
         error = offsets[rows, columns].ravel()
         return np.asarray(dense.product(dense.product(loose + tight, H.T), dense.solve(S, error)))
 
@@ -244,58 +216,25 @@ def track_window(scans: Scans, settings: AssociationSettings) -> TrackedWindow:
     """Associate a window's detections scan by scan."""
     tracker = Tracker(settings, len(scans.points))
     landmark_of = np.full(len(scans.points), UNASSIGNED)
-    bounds = scans.bounds
     poses = np.empty_like(scans.motions)
     slips: list[Slip] = []
     for k, motion in enumerate(scans.motions):
         tracker.predict_pose(motion, scans.motion_covariances[k])
-        of_scan = slice(bounds[k], bounds[k + 1])
-        points, covariances = scans.points[of_scan], scans.covariances[of_scan]
-        names = scans.names[of_scan]
-        found = tracker.match_scan(points, covariances, names)
-        if settings.slip_m and _is_slip_suspected(
-            tracker, found, points, covariances, settings.slip_m
-        ):
-            by = tracker.find_slip(points, covariances, found)
+        scan = scans.detections(k)
+        found = tracker.match_scan(scan)
+        if settings.slip_m and tracker.is_slip_suspected(scan, found):
+            by = tracker.find_slip(scan, found)
             if by is not None:
                 slips.append(Slip(k, by))
                 tracker.apply_slip(by)
-                found = tracker.match_scan(points, covariances, names)
+                found = tracker.match_scan(scan)
         known = np.nonzero(found != UNASSIGNED)[0]
-        tracker.update(found[known], points[known], covariances[known])
-        for row in np.nonzero(found == UNASSIGNED)[0]:
-            found[row] = tracker.add_landmark(points[row], covariances[row], int(names[row]))
-        landmark_of[of_scan] = found
+        tracker.update(found[known], scan.select(known))
+        for row in np.nonzero(found == UNASSIGNED)[0].tolist():
+            found[row] = tracker.add_landmark(scan, row)
+        landmark_of[scans.rows[k]] = found
         poses[k] = tracker.pose
     return TrackedWindow(landmark_of, tracker.names, poses, tracker.landmarks.copy(), slips)
-
-
-def _is_slip_suspected(
-    tracker: Tracker,
-    found: Int64[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 2"],
-    covariances: Float[np.ndarray, "n 2 2"],
-    reach: float,
-) -> bool:
-    known = np.nonzero(found != UNASSIGNED)[0]
-    if len(points) < SLIP_DETECTIONS or len(tracker.names) < SLIP_DETECTIONS:
-        return False
-    if len(known) < FEW * len(points) or _is_match_missed(tracker, found, points, reach):
-        return True
-    return tracker.joint_distance_ratio(found[known], points[known], covariances[known]) > 1.0
-
-
-def _is_match_missed(
-    tracker: Tracker,
-    found: Int64[np.ndarray, " n"],
-    points: Float[np.ndarray, "n 2"],
-    reach: float,
-) -> bool:
-    seen, _ = tracker.predict_landmarks()
-    free = np.ones(len(seen), np.bool_)
-    free[found[found != UNASSIGNED]] = False
-    offsets = points[found == UNASSIGNED][:, None] - seen[free][None]
-    return bool((core.hypot(offsets[..., 0], offsets[..., 1]) < reach).any())
 
 
 def _smaller_eigenvalue(S: Float[np.ndarray, "l 2 2"]) -> Float[np.ndarray, " l"]:

@@ -7,7 +7,8 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.association import AssociationProfile
-from teamslam.team.estimation.association.gating import Indices, Pair, evaluate_pairs
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.gating import Indices, Pair
 from teamslam.team.estimation.association.island_view import IslandView
 from teamslam.team.shapes import Float
 
@@ -165,7 +166,7 @@ def find_possible_duplicates(
     profile, joint = view.profile, view.joint
     own: Indices = np.array([view.place_of[id_] for id_ in sorted(ids)], np.int64)
     one, two = (own[each] for each in np.triu_indices(len(own), 1))
-    at = evaluate_pairs(joint, one, two, profile)
+    at = joint.evaluate(one, two)
     decidable = at.llr + 0.5 * at.chi2 >= profile.llr_tight
     part = np.array([parts.get(id_, 0) for id_ in sorted(ids)], np.int64)
     by_odometry = np.not_equal(*(part[each] for each in np.triu_indices(len(own), 1)))
@@ -176,10 +177,7 @@ def find_possible_duplicates(
         one[maybe].tolist(), two[maybe].tolist(), at.llr[maybe].tolist(), strict=True
     ):
         llr.setdefault(a, {})[b] = llr.setdefault(b, {})[a] = ratio
-    n = len(joint.mean)
-    xx, xy, _, yy = (
-        joint.covariance.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)].reshape(n, 4).T
-    )
+    xx, xy, _, yy = dense.diagonal_blocks(joint.covariance).reshape(-1, 4).T
     area = xx * yy - xy * xy
     stays: set[int] = set()
     out: dict[int, int] = {}

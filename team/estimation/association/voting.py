@@ -12,7 +12,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
-from teamslam.team.estimation.association.classes import (
+from teamslam.team.estimation.association.gating import (
     CONTRADICTED,
     Classes,
     compare_classes,

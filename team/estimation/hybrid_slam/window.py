@@ -278,5 +278,5 @@ def of_base(window: Window) -> Window:
 def motion_alone(motion: Increment) -> LocalMap:
     """Make the Gaussian of a window's odometry alone."""
     G = tangent(motion.mean[2])
-    covariance = dense.product(dense.product(G, motion.covariance), G.T) + np.diag(core.POSE_JITTER)
+    covariance = dense.congruent(G, motion.covariance) + np.diag(core.POSE_JITTER)
     return LocalMap(np.empty(0, np.uint32), motion.mean, 0.5 * (covariance + covariance.T))

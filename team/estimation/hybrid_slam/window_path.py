@@ -93,7 +93,6 @@ def placed(
         )
         J[:, :3] += np.eye(3)
         J[:, 2] += [-s * local[k, 0] - c * local[k, 1], c * local[k, 0] - s * local[k, 1], 0.0]
-        covariances[k] = dense.product(
-            dense.product(J, ends.covariance), J.T
-        ) + covariance_factor * (dense.product(dense.product(turn, left), turn.T))
+        within = covariance_factor * dense.congruent(turn, left)
+        covariances[k] = dense.congruent(J, ends.covariance) + within
     return poses, 0.5 * (covariances + covariances.transpose(0, 2, 1))

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from teamslam.team.estimation.association.density import LandmarkDensity
+from teamslam.team.estimation.association.gating import LandmarkDensity
 from teamslam.team.estimation.association.landmark_sets import OPEN, Opened, Verdict
 from teamslam.team.estimation.association.member_log import LocalLandmark
 from teamslam.team.estimation.association.verification import overlap_share

@@ -16,7 +16,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.association.gating import Joint, evaluate_pairs, list_pairs
+from teamslam.team.estimation.association.gating import Joint, list_pairs
 from teamslam.team.estimation.contribution import Stream, first_of
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.submap_graph import Joined
@@ -144,10 +144,9 @@ def _mark_possible(
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "a b"]]:
     mean, covariance = joint_marginal(island, nodes.tolist())
     points = mean.reshape(-1, 2)
-    joint = Joint(points, covariance, np.zeros((len(nodes), len(nodes)), np.bool_))
-    first, second = list_pairs(one, two)
     profile = island.settings.association
-    fits = evaluate_pairs(joint, first, second, profile).chi2 < profile.gate
+    joint = Joint(points, covariance, np.zeros((len(nodes), len(nodes)), np.bool_), profile)
+    fits = joint.evaluate(*list_pairs(one, two)).chi2 < profile.gate
     possible = np.equal.outer(one, two)
     possible[~possible] = fits
     return points, possible

@@ -11,7 +11,7 @@ from teamslam.team.estimation.association.closure import (
     search_island,
     search_other_island,
 )
-from teamslam.team.estimation.association.gating import gate_pairs, list_pairs
+from teamslam.team.estimation.association.gating import list_pairs
 from teamslam.team.estimation.association.island_view import IslandView, ViewedSubmap
 from teamslam.team.estimation.association.joint_compatibility import MergedPairs
 from teamslam.team.estimation.association.landmark_sets import (
@@ -137,7 +137,7 @@ def _recognise_in(fold: Fold, key: Stream) -> Fold:
     old = old[np.array([each.chance < FALSE_ALARM for each in places], np.bool_)] if places else old
     if not len(old) or not len(new):
         return fold
-    one, two, sds = gate_pairs(view.joint, *list_pairs(new, old), view.profile)
+    one, two, sds = view.joint.gate(*list_pairs(new, old))
     for first, second, sd in zip(one.tolist(), two.tolist(), sds.tolist(), strict=True):
         number, before = view.ids[first], view.ids[second]
         of = [s.contribution.stream for s in maps if island.graph.landmarks[before] in s.landmarks]

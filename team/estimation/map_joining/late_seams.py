@@ -20,7 +20,8 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.association.gating import Joint, evaluate_pairs, list_pairs
+from teamslam.team.estimation import dense
+from teamslam.team.estimation.association.gating import Joint, list_pairs
 from teamslam.team.estimation.association.visibility import LEAST_OVERLOOKED
 from teamslam.team.estimation.contribution import Stream, is_map
 from teamslam.team.estimation.map_joining.absence import distances, learn_rate, path_of
@@ -154,12 +155,12 @@ def _uncertainty_of(
     at = np.add.outer(first[np.searchsorted(union, sights.nodes)], np.arange(2))
     own = covariance[np.ix_(at.ravel(), at.ravel())]
     pairs = list_pairs(np.arange(n), np.arange(n))
-    joint = Joint(points, own, np.zeros((n, n), np.bool_))
     profile = island.settings.association
+    joint = Joint(points, own, np.zeros((n, n), np.bool_), profile)
     possible = np.eye(n, dtype=np.bool_)
-    possible[pairs] = evaluate_pairs(joint, *pairs, profile).chi2 < profile.gate
+    possible[pairs] = joint.evaluate(*pairs).chi2 < profile.gate
     spread = np.zeros(sights.away.shape)
-    blocks = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    blocks = dense.diagonal_blocks(own)
     for row, pair in zip(spread, ends, strict=True):
         offsets = points[:, None] - island.points(pair)
         nearer = (offsets * offsets).sum(axis=2).argmin(axis=1)

@@ -50,7 +50,7 @@ def _seen(submaps: list[list[int]], common: float) -> tuple[Joint, list[np.ndarr
     points = TWINS[[k for each in submaps for k in each]]
     points = points + common * rng.normal(size=(len(submaps), 2))[owner]
     points = points + OWN * rng.normal(size=points.shape)
-    return Joint(points, covariance, apart), [
+    return Joint(points, covariance, apart, PROFILE), [
         np.flatnonzero(owner == k) for k in range(len(submaps))
     ]
 
@@ -60,7 +60,7 @@ def _rows(submaps: list[np.ndarray], joint: Joint) -> Bool[np.ndarray, "K n"]:
 
 
 def _pairs(joint: Joint, own: np.ndarray, candidates: np.ndarray) -> list[tuple[int, int]]:
-    found = assign_jointly(joint, *list_pairs(own, candidates), PROFILE, 0.5)
+    found = assign_jointly(joint, *list_pairs(own, candidates), 0.5)
     return sorted((pair.first, pair.second) for pair in found.pairs)
 
 
@@ -68,30 +68,26 @@ def test_unmerged_fragments_do_not_keep_a_submap_from_being_associated():
     joint, (own, *others) = _seen([[0, 1, 2, 3]] * 5, common=0.15)
     assert not _pairs(joint, own, np.concatenate(others))
     found = set()
-    for candidates in select_comparisons(joint, own, _rows(others, joint), PROFILE, 0.5):
+    for candidates in select_comparisons(joint, own, _rows(others, joint), 0.5):
         found |= {(one, two % 4) for one, two in _pairs(joint, own, candidates)}
     assert found == {(k, k) for k in range(4)}
 
 
 def test_a_landmark_that_the_other_submap_missed_is_a_rival_of_those_that_it_has():
     joint, (own, other, whole) = _seen([[1], [0], [0, 1]], common=0.04)
-    fits = select_comparisons(joint, own, _rows([other], joint), PROFILE, 0.5)
+    fits = select_comparisons(joint, own, _rows([other], joint), 0.5)
     assert [each.tolist() for each in fits] == [other.tolist()]
     apart = joint.apart.copy()
     apart[other, whole[1]] = apart[whole[1], other] = True  # one keyframe saw the two together
-    with_rival = select_comparisons(
-        joint._replace(apart=apart), own, _rows([other], joint), PROFILE, 0.5
-    )
+    with_rival = select_comparisons(joint._replace(apart=apart), own, _rows([other], joint), 0.5)
     assert [each.tolist() for each in with_rival] == [other.tolist()]
-    both = select_comparisons(
-        joint._replace(apart=apart), own, _rows([other, whole], joint), PROFILE, 0.5
-    )
+    both = select_comparisons(joint._replace(apart=apart), own, _rows([other, whole], joint), 0.5)
     assert [other[0], whole[1]] in [each.tolist() for each in both]
 
 
 def test_landmarks_that_may_be_one_are_undecided():
     joint, (one, two) = _seen([[0, 1], [0, 2]], common=0.15)
-    assert find_undecided(joint, np.arange(4), PROFILE).tolist() == [one[0], one[1], two[0]]
+    assert find_undecided(joint, np.arange(4)).tolist() == [one[0], one[1], two[0]]
 
 
 def test_every_older_submap_is_examined_again_by_turns():

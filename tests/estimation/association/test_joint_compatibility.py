@@ -7,22 +7,18 @@ import pytest
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import AssociationSettings
 from teamslam.team.estimation.association.certainty import marginals
-from teamslam.team.estimation.association.classes import compare_classes
 from teamslam.team.estimation.association.clustering import associate_window
 from teamslam.team.estimation.association.gating import (
     SPLIT,
     Joint,
-    evaluate_pairs,
-    gate_pairs,
-    match_scan,
+    compare_classes,
 )
 from teamslam.team.estimation.association.joint_compatibility import (
     assign_jointly,
-    condition_on_pair,
     grow_alignment,
     grow_pairs,
 )
-from teamslam.team.estimation.association.scans import UNASSIGNED
+from teamslam.team.estimation.association.scans import UNASSIGNED, Detections, match_scan
 from teamslam.team.estimation.association.voting import PointSet, propose_alignments
 from tests.estimation.association.test_clustering import pairs, window
 
@@ -32,15 +28,16 @@ def test_a_name_matches_at_any_distance_and_only_its_own_landmark():
     names, mapped = np.array([7, 8, UNASSIGNED]), np.array([UNASSIGNED, 7, UNASSIGNED])
     seen = np.array([(0.0, 0.0), (1.0, 0.0), (5.0, 0.1)])
     small = np.tile(0.01 * np.eye(2), (3, 1, 1))
-    found = match_scan(points, small, names, (seen, small), mapped, AssociationSettings())
+    scan = Detections(points, small, names)
+    found = match_scan(scan, (seen, small), mapped, AssociationSettings())
     assert found.tolist() == [1, UNASSIGNED, 2]
 
 
 def test_a_pairs_likelihood_is_that_of_its_difference_against_a_stray_landmark():
     profile = AssociationProfile(slack=0.0)
     points = np.array([(0.0, 0.0), (0.1, -0.05)])
-    joint = Joint(points, 0.01 * np.eye(4), np.zeros((2, 2), np.bool_))
-    at = evaluate_pairs(joint, np.array([0]), np.array([1]), profile)
+    joint = Joint(points, 0.01 * np.eye(4), np.zeros((2, 2), np.bool_), profile)
+    at = joint.evaluate(np.array([0]), np.array([1]))
     S = 0.02 * np.eye(2)
     d = np.array([-0.1, 0.05])
     chi2 = d @ np.linalg.solve(S, d)
@@ -61,19 +58,20 @@ def reported(classes: list[int], count: int = 3) -> np.ndarray:
 
 def joint(classes: np.ndarray | None) -> Joint:
     mean = np.array([[0.0, 0.0], [0.02, 0.0], [5.0, 0.0]])
-    return Joint(mean, 1e-4 * np.eye(6), np.zeros((3, 3), np.bool_), classes=classes)
+    return Joint(
+        mean, 1e-4 * np.eye(6), np.zeros((3, 3), np.bool_), AssociationProfile(), classes=classes
+    )
 
 
 def test_landmarks_of_contradicting_classes_are_not_in_the_gate():
-    profile = AssociationProfile()
     pair = np.array([0]), np.array([1])
-    plain = evaluate_pairs(joint(None), *pair, profile)
-    alike = evaluate_pairs(joint(reported([1, 1, 0])), *pair, profile)
+    plain = joint(None).evaluate(*pair)
+    alike = joint(reported([1, 1, 0])).evaluate(*pair)
     assert plain.chi2 == alike.chi2
     assert alike.llr - plain.llr == pytest.approx(compare_classes(reported([1]), reported([1])))
-    assert len(gate_pairs(joint(reported([1, 1, 0])), *pair, profile)[0]) == 1
-    assert len(gate_pairs(joint(reported([1, 2, 0])), *pair, profile)[0]) == 0
-    assert len(gate_pairs(joint(None), *pair, profile)[0]) == 1
+    assert len(joint(reported([1, 1, 0])).gate(*pair)[0]) == 1
+    assert len(joint(reported([1, 2, 0])).gate(*pair)[0]) == 0
+    assert len(joint(None).gate(*pair)[0]) == 1
 
 
 def test_of_two_places_of_equal_shape_the_one_of_equal_classes_gets_the_votes():
@@ -136,18 +134,28 @@ def _joint(points: list[tuple[float, float]], sd: float, common: float = 0.0) ->
     covariance = sd**2 * np.eye(2 * n)
     half = np.zeros((2 * n, 2))
     half[n - n % 2 :: 2, 0] = half[n - n % 2 + 1 :: 2, 1] = common
-    return Joint(np.array(points), covariance + half @ half.T, np.zeros((n, n), np.bool_))
+    return Joint(
+        np.array(points),
+        covariance + half @ half.T,
+        np.zeros((n, n), np.bool_),
+        PROFILE_JOINT_COMPATIBILITY,
+    )
 
 
 def test_conditioning_on_a_pair_is_the_kalman_filters_measurement_of_no_difference():
     rng = np.random.default_rng(3)
     root = rng.normal(size=(8, 8))
-    joint = Joint(rng.normal(size=(4, 2)), root @ root.T, np.zeros((4, 4), np.bool_))
+    joint = Joint(
+        rng.normal(size=(4, 2)),
+        root @ root.T,
+        np.zeros((4, 4), np.bool_),
+        PROFILE_JOINT_COMPATIBILITY,
+    )
     H = np.zeros((2, 8))
     H[:, 2:4], H[:, 6:8] = np.eye(2), -np.eye(2)
     S = H @ joint.covariance @ H.T
     K = joint.covariance @ H.T @ np.linalg.inv(S)
-    found = condition_on_pair(joint, 1, 3, PROFILE_JOINT_COMPATIBILITY)
+    found = joint.condition(1, 3)
     assert found.mean.ravel() == pytest.approx(joint.mean.ravel() - K @ H @ joint.mean.ravel())
     assert found.covariance == pytest.approx(joint.covariance - K @ S @ K.T)
 
@@ -158,11 +166,11 @@ def test_a_common_error_is_estimated_by_the_first_pair_and_the_others_follow():
     new = [(x + shift, y) for x, y in old]
     joint = _joint([*old, *new], sd=0.02, common=3.0)
     one, two = (each.ravel() for each in np.meshgrid([3, 4, 5], [0, 1, 2], indexing="ij"))
-    found = grow_alignment(joint, (one, two), [(3, 0)], PROFILE_JOINT_COMPATIBILITY, np.inf)
+    found = grow_alignment(joint, (one, two), [(3, 0)], np.inf)
     assert {(pair.first, pair.second) for pair in found.pairs} == {(3, 0), (4, 1), (5, 2)}
     assert found.pairs[0].sd > 1.0 > found.pairs[1].sd
     for pair in found.pairs:
-        joint = condition_on_pair(joint, pair.first, pair.second, PROFILE_JOINT_COMPATIBILITY)
+        joint = joint.condition(pair.first, pair.second)
     assert found.mean == pytest.approx(joint.mean)
 
 
@@ -171,20 +179,18 @@ def test_two_equal_partners_block_each_other_and_fragments_of_one_landmark_do_no
     one, two = np.array([0, 0]), np.array([1, 2])
     rivals = joint._replace(apart=joint.apart.copy())
     rivals.apart[1, 2] = rivals.apart[2, 1] = True
-    waits = grow_pairs(rivals, (one, two), PROFILE_JOINT_COMPATIBILITY)
+    waits = grow_pairs(rivals, (one, two))
     assert not waits.pairs
-    fragments = grow_pairs(joint, (one, two), PROFILE_JOINT_COMPATIBILITY)
+    fragments = grow_pairs(joint, (one, two))
     assert len(fragments.pairs) == 1
 
 
 def test_landmarks_of_one_scan_are_never_merged_and_merged_ones_inherit_this():
     joint = _joint([(0.0, 0.0), (0.02, 0.0), (0.01, 0.0)], sd=0.05)
     joint.apart[0, 1] = joint.apart[1, 0] = True
-    found = grow_pairs(
-        joint, (np.array([0, 1, 0]), np.array([2, 2, 1])), PROFILE_JOINT_COMPATIBILITY
-    )
+    found = grow_pairs(joint, (np.array([0, 1, 0]), np.array([2, 2, 1])))
     assert len(found.pairs) <= 1
-    after = condition_on_pair(joint, 0, 2, PROFILE_JOINT_COMPATIBILITY)
+    after = joint.condition(0, 2)
     assert after.apart[2, 1]
     assert after.apart[1, 2]
 
@@ -192,20 +198,16 @@ def test_landmarks_of_one_scan_are_never_merged_and_merged_ones_inherit_this():
 def test_landmarks_of_one_window_need_more_evidence_and_merged_ones_inherit_this():
     joint = _joint([(0.0, 0.0), (0.2, 0.0), (0.4, 0.0)], sd=0.08)
     one, two = np.array([0]), np.array([1])
-    llr = evaluate_pairs(joint, one, two, PROFILE_JOINT_COMPATIBILITY).llr[0]
+    llr = joint.evaluate(one, two).llr[0]
     assert (
         PROFILE_JOINT_COMPATIBILITY.llr_tight < llr < PROFILE_JOINT_COMPATIBILITY.llr_tight + SPLIT
     )
     split = np.zeros((3, 3), np.bool_)
     split[0, 1] = split[1, 0] = True
     for beside, merged in ((None, 1), (split, 0)):
-        found = grow_pairs(
-            joint._replace(apart_in_window=beside), (one, two), PROFILE_JOINT_COMPATIBILITY
-        )
+        found = grow_pairs(joint._replace(apart_in_window=beside), (one, two))
         assert len(found.pairs) == merged
-    after = condition_on_pair(
-        joint._replace(apart_in_window=split), 1, 2, PROFILE_JOINT_COMPATIBILITY
-    ).apart_in_window
+    after = joint._replace(apart_in_window=split).condition(1, 2).apart_in_window
     assert after[0, 2]
     assert after[2, 0]
 
@@ -224,14 +226,14 @@ def _twins(seen: list[int], common: float) -> tuple[Joint, np.ndarray, np.ndarra
     apart[:n, :n] = apart[n:, n:] = True
     np.fill_diagonal(apart, False)
     one, two = np.meshgrid(np.arange(n, n + m), np.arange(n), indexing="ij")
-    return Joint(points, covariance + both @ both.T, apart), one.ravel(), two.ravel()
+    return Joint(points, covariance + both @ both.T, apart, DENSE), one.ravel(), two.ravel()
 
 
 def test_neighbours_are_distinguished_jointly_where_each_by_itself_is_not():
     joint, one, two = _twins([0, 1, 2, 3], common=0.15)
-    alone = grow_pairs(joint, (one, two), DENSE)
+    alone = grow_pairs(joint, (one, two))
     assert not alone.pairs
-    found = assign_jointly(joint, one, two, DENSE, 0.5)
+    found = assign_jointly(joint, one, two, 0.5)
     assert sorted((p.first, p.second) for p in found.pairs) == [(4, 0), (5, 1), (6, 2), (7, 3)]
 
 
@@ -245,9 +247,9 @@ def test_a_few_uncertain_landmarks_that_fit_others_by_chance_are_not_merged():
         shift[6::2, 0] = shift[7::2, 1] = 1.0
         seen = np.arange(n) >= len(known)
         apart = (seen[:, None] == seen) & ~np.eye(n, dtype=np.bool_)
-        joint = Joint(points, sd**2 * np.eye(2 * n) + shift @ shift.T, apart)
+        joint = Joint(points, sd**2 * np.eye(2 * n) + shift @ shift.T, apart, profile)
         one, two = (each.ravel() for each in np.meshgrid(np.arange(3, n), np.arange(3)))
-        found = assign_jointly(joint, one, two, profile, 2.0)
+        found = assign_jointly(joint, one, two, 2.0)
         assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(merged)]
 
 
@@ -264,12 +266,12 @@ def test_far_landmarks_are_merged_that_near_ones_make_certain(heading_sigma, mer
     points = np.concatenate([known, known + turned[6:].reshape(-1, 2)])
     seen = np.arange(6) >= 3
     apart = (seen[:, None] == seen) & ~np.eye(6, dtype=np.bool_)
-    joint = Joint(points, 0.08**2 * np.eye(12) + turned @ turned.T, apart)
+    joint = Joint(points, 0.08**2 * np.eye(12) + turned @ turned.T, apart, profile)
     one, two = (each.ravel() for each in np.meshgrid(np.arange(3, 6), np.arange(3)))
-    at = evaluate_pairs(joint, np.arange(3, 6), np.arange(3), profile)
+    at = joint.evaluate(np.arange(3, 6), np.arange(3))
     assert at.llr[0] < profile.llr_loose
     assert at.sd[1:].min() > most_sd
-    found = assign_jointly(joint, one, two, profile, most_sd)
+    found = assign_jointly(joint, one, two, most_sd)
     assert [(p.first, p.second) for p in found.pairs] == [(3 + k, k) for k in range(merged)]
 
 
@@ -280,10 +282,11 @@ def test_a_pair_that_only_a_doubtful_pair_makes_certain_is_evaluated_without_it(
     shift[6::2, 0] = shift[7::2, 1] = 1.0
     seen = np.arange(5) >= 3
     apart = (seen[:, None] == seen) & ~np.eye(5, dtype=np.bool_)
-    joint = Joint(points, 0.05**2 * np.eye(10) + shift @ shift.T, apart)
+    covariance = 0.05**2 * np.eye(10) + shift @ shift.T
     one, two = (each.ravel() for each in np.meshgrid([3, 4], [0, 1, 2], indexing="ij"))
     for density, merged in ((0.05, []), (0.006, [(4, 2)])):
         profile = AssociationProfile(slack=0.0, density=density, same=0.1)
-        found = assign_jointly(joint, one, two, profile, 2.0)
+        joint = Joint(points, covariance, apart, profile)
+        found = assign_jointly(joint, one, two, 2.0)
         assert [(p.first, p.second) for p in found.pairs] == merged
         assert all(p.sd > 1.0 for p in found.pairs), "it is known to a metre, whatever the first is"
