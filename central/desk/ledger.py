@@ -4,7 +4,7 @@ Measurements after the last submap are open if consumed, else lost.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -133,10 +133,10 @@ def ledger(log: Recorded, progress: Callable[[str], None] = lambda _: None) -> L
             for s in submaps
             if s.gated
         ]
-    maps, unknown = _maps(log)
+    fused = log.of(m.FusedMap, ch.FUSED_MAP, ch.FINAL_MAP)
+    maps, unknown = _maps(log, fused)
     rejected = tuple(_rejected(log, entries))
-    last = log.of(m.FusedMap, ch.FUSED_MAP, ch.FINAL_MAP)[-1:]
-    withdrawn = last[0].withdrawn if last else ()
+    withdrawn = fused[-1].withdrawn if fused else ()
     return Ledger(entries, maps, (*offenders, *unknown), withdrawn, rejected, tuple(outliers))
 
 
@@ -231,12 +231,14 @@ def _contradictions(log: Recorded, stream: Stream, entries: tuple[Entry, ...]) -
             yield f"{_name(stream)} reports {announced}, the log has {found}"
 
 
-def _maps(log: Recorded) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
+def _maps(
+    log: Recorded, maps: Iterable[m.FusedMap]
+) -> tuple[dict[SubmapName, tuple[str, ...]], list[str]]:
     users: dict[SubmapName, list[str]] = {
         (s.robot, s.incarnation, s.sequence): [] for s in log.of(m.Submap, ch.SUBMAP)
     }
     wrong = []
-    for fused in log.of(m.FusedMap, ch.FUSED_MAP, ch.FINAL_MAP):
+    for fused in maps:
         if fused.rule != "join":
             continue
         digest = fused.digest.hex()

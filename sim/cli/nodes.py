@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import click
 
@@ -24,15 +24,8 @@ from teamslam.sim.cli.commands import (
 from teamslam.sim.scenarios.scenario import Scenario, scenario_warnings, with_options
 
 if TYPE_CHECKING:
-    import threading
-
-    from teamslam.central.main import CentralShell
-    from teamslam.central.peers.main import CentreShell, PeerShell
-    from teamslam.team.config import RobotConfig
     from teamslam.team.recording.parts import OwnLog
-    from teamslam.team.wire.bus import Bus
     from teamslam.team.wire.channels import Channel
-    from teamslam.team.wire.messages import SavedMap
 
 _LOG = logging.getLogger("teamslam")
 
@@ -136,7 +129,7 @@ def robot(
         ),
     ] = None,
     fold: Annotated[
-        str,
+        Literal["always", "request", "end"],
         rare(
             "With --peers: fold the set always, on request (`teamslam map peer`) and at the "
             "end, or at the end only.",
@@ -177,10 +170,27 @@ def robot(
     ):
         bus.tap = tap
         _connected(resolved, connect)
-        if resolved.peers:
-            _peer_shell(bus, resolved, config, stop, store, fold, keys, maps).run()
-        else:
+        if not resolved.peers:
             RobotShell(bus, config, stop, exchange=resolved.exchange).run()
+            return
+        from teamslam.central.peers.main import PeerShell
+        from teamslam.sim.radio.bus import behind_radio
+        from teamslam.team.peers.set_file import SetFileError
+
+        with refusing(SetFileError):
+            shell = PeerShell(
+                bus if resolved.radio.is_perfect else behind_radio(bus, name, resolved.radio),
+                config,
+                stop,
+                central=resolved.central,
+                robots=[each.id for each in resolved.robots],
+                store=store,
+                exchange=resolved.exchange,
+                when=fold,
+                signer=opt.signer_of(keys, f"robot-{name}", resolved.team),
+                maps=maps,
+            )
+        shell.run()
 
 
 def _own_log(log: Path | None, scenario: Scenario) -> AbstractContextManager["OwnLog | None"]:
@@ -189,40 +199,6 @@ def _own_log(log: Path | None, scenario: Scenario) -> AbstractContextManager["Ow
     from teamslam.team.recording.parts import own_log
 
     return own_log(log, scenario.team)
-
-
-def _peer_shell(
-    bus: "Bus",
-    scenario: Scenario,
-    config: "RobotConfig",
-    stop: "threading.Event",
-    store: Path | None,
-    fold: str,
-    keys: Path | None,
-    maps: "Sequence[SavedMap]",
-) -> "PeerShell":
-    from teamslam.central.peers.fold import FoldWhen
-    from teamslam.central.peers.main import PeerShell
-    from teamslam.sim.radio.bus import behind_radio
-    from teamslam.team.peers.set_file import SetFileError
-
-    if fold not in get_args(FoldWhen):
-        refuse(f"--fold is always, request or end, not {fold!r}")
-    signer = opt.signer_of(keys, f"robot-{config.id}", scenario.team)
-    with refusing(SetFileError):
-        door = bus if scenario.radio.is_perfect else behind_radio(bus, config.id, scenario.radio)
-        return PeerShell(
-            door,
-            config,
-            stop,
-            central=scenario.central,
-            robots=[each.id for each in scenario.robots],
-            store=store,
-            exchange=scenario.exchange,
-            when=cast(FoldWhen, fold),
-            signer=signer,
-            maps=maps,
-        )
 
 
 @app.declare("teamslam central waypoints")
@@ -259,6 +235,8 @@ def central(
 
     With --peers it is one more peer, which may join and leave at any time.
     """
+    from teamslam.central.main import CentralShell
+    from teamslam.central.peers.main import CentreShell
     from teamslam.team.peers.set_file import SetFileError
     from teamslam.team.shell import process
 
@@ -277,36 +255,14 @@ def central(
         opt.connect_bus(resolved.team, connect, keys, "central", stop) as bus,
     ):
         _connected(resolved, connect)
+        of_team = bus, resolved.central, [config.id for config in resolved.robots], stop
         with refusing(SetFileError):
-            _central_shell(bus, resolved, stop, store, patience, keys, maps).run()
-
-
-def _central_shell(
-    bus: "Bus",
-    scenario: Scenario,
-    stop: "threading.Event",
-    store: Path | None,
-    patience: float | None,
-    keys: Path | None,
-    maps: "Sequence[SavedMap]",
-) -> "CentralShell | CentreShell":
-    from teamslam.central.main import CentralShell
-    from teamslam.central.peers.main import CentreShell
-
-    names = [config.id for config in scenario.robots]
-    if not scenario.peers:
-        return CentralShell(
-            bus,
-            scenario.central,
-            names,
-            stop,
-            patience,
-            admit=scenario.admits,
-            store=store,
-            maps=maps,
-        )
-    signer = opt.signer_of(keys, "central", scenario.team)
-    return CentreShell(bus, scenario.central, names, stop, store=store, signer=signer, maps=maps)
+            if resolved.peers:
+                signer = opt.signer_of(keys, "central", resolved.team)
+                CentreShell(*of_team, store=store, signer=signer, maps=maps).run()
+            else:
+                admit = resolved.admits
+                CentralShell(*of_team, patience, admit=admit, store=store, maps=maps).run()
 
 
 @app.declare("teamslam record waypoints -o team.mcap")
@@ -404,11 +360,6 @@ def _join_parts(log: Path) -> list[Path]:
 
 
 def _fail_if_provisional(parts: Sequence[Path], ends: "Sequence[Channel]") -> None:
-    if lacks := _lacking_in(parts, ends):
-        fail(lacks)
-
-
-def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
     from teamslam.team.recording.reader import LogError, open_log
     from teamslam.team.shell import describe_missing
     from teamslam.team.wire.codec import WireError, decoded
@@ -421,4 +372,5 @@ def _lacking_in(parts: Sequence[Path], ends: "Sequence[Channel]") -> str:
                 found[sample.key] = describe_missing(decoded(sample.payload, FusedMap))
         except (LogError, WireError, OSError) as error:
             _LOG.debug("%s", error)
-    return "; ".join(dict.fromkeys(filter(None, found.values())))
+    if lacks := "; ".join(dict.fromkeys(filter(None, found.values()))):
+        fail(lacks)

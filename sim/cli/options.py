@@ -231,25 +231,25 @@ def count_noun(count: int, what: str) -> str:
 
 def parse_speed(text: str) -> float:
     """Multiple of real time; infinite for `max`."""
-    if text == "max":
-        return math.inf
-    try:
-        speed = float(text)
-    except ValueError:
-        speed = math.nan
-    if not (speed > 0.0 and math.isfinite(speed)):
+    speed = math.inf if text == "max" else number_in(text)
+    if not 0.0 < speed < math.inf and text != "max":
         refuse(f"--speed {text}: give a positive number, or max")
     return speed
+
+
+def number_in(text: str) -> float:
+    """Number of a text, or NaN."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def parse_start(text: str) -> tuple[str, tuple[float, ...]]:
     """Robot (may be empty) and numbers of `[ROBOT:]x,y,theta[,sigma,sigma]`."""
     robot, colon, numbers = text.rpartition(":")
-    try:
-        pose = tuple(float(part) for part in numbers.split(","))
-    except ValueError:
-        pose = ()
-    if len(pose) not in (3, 5) or (colon and not robot):
+    pose = tuple(map(number_in, numbers.split(",")))
+    if len(pose) not in (3, 5) or any(map(math.isnan, pose)) or (colon and not robot):
         refuse(f"--start {text}: give x,y,theta in m and rad, as 0,0,1.57 or r1:0,0,1.57")
     if abs(pose[2]) > 2.0 * math.pi:
         refuse(f"--start {text}: theta is in radians, in one turn: {pose[2]:g} is not")

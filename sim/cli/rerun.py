@@ -100,14 +100,18 @@ def rerun(
     opt.saved_maps(map_)
     if localise:
         opt.check_localises(map_)
+    if window is not None and not 0.0 < window < math.inf:
+        refuse(f"--window {window}: give a positive number")
+    if not 0.0 <= loss < 1.0:
+        refuse(f"--loss {loss}: give a probability from 0 to below 1")
     changes = Changes(
         without=tuple(without or ()),
         fusion=fusion,
         estimator=estimator,
         particles=particles,
-        window_s=_positive(window, "--window"),
+        window_s=window,
         seed=seed,
-        loss=_probability(loss),
+        loss=loss,
         delay_s=delay,
         no_centre=None if no_centre is None else _span(no_centre, "--no-centre"),
         partitions=tuple(_partition(each) for each in partition or ()),
@@ -125,23 +129,9 @@ def rerun(
         refuse("--verify compares with the log as it is: leave the changes away")
 
 
-def _positive(value: float | None, option: str) -> float | None:
-    if value is not None and not (value > 0.0 and math.isfinite(value)):
-        refuse(f"{option} {value}: give a positive number")
-    return value
-
-
-def _probability(loss: float) -> float:
-    if not 0.0 <= loss < 1.0:
-        refuse(f"--loss {loss}: give a probability from 0 to below 1")
-    return loss
-
-
 def _span(text: str, option: str) -> tuple[float, float]:
-    try:
-        begin, end = (float(part) for part in text.split("-"))
-    except ValueError:
-        begin, end = math.nan, math.nan
+    first, _, last = text.partition("-")
+    begin, end = opt.number_in(first), opt.number_in(last)
     if not 0.0 <= begin < end < math.inf:
         refuse(f"{option} {text}: give seconds since the log's first measurement, as 60-120")
     return begin, end
@@ -160,10 +150,7 @@ def _noise(asked: list[str]) -> tuple[tuple[str, float], ...]:
     factors: dict[str, float] = {}
     for text in asked:
         kind, _, number = text.partition("=")
-        try:
-            factor = float(number)
-        except ValueError:
-            factor = math.nan
+        factor = opt.number_in(number)
         if kind not in KINDS or not 0.0 < factor < math.inf:
             refuse(
                 f"--noise {text}: give one of {', '.join(KINDS)} and a factor above 0, as range=2"

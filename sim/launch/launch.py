@@ -37,27 +37,18 @@ class Plan:
         """Certificate option of every process."""
         return [] if self.keys is None else ["--keys", str(self.keys)]
 
-    def maps_of(self, node: str) -> list[str]:
-        """Options of the saved maps of a peer or centre."""
-        if not (self.scenario.peers or node == "central"):
-            return []
-        return [word for path in self.maps for word in ("--map", str(path.resolve()))]
-
-    def set_file(self, node: str) -> Path:
-        """File of a node's set; "*": pattern of all."""
-        return self.folder / f"{node}.set"
-
-    def stores(self, node: str) -> list[str]:
-        """Storage option of a peer or centre."""
+    def fold_options(self, node: str) -> list[str]:
+        """Options of a peer or centre that joins submaps: file of its set, saved maps."""
         scenario = self.scenario
         if not (scenario.peers or (node == "central" and scenario.central.fusion == "join")):
             return []
-        return ["--set", str(self.set_file(node))]
+        maps = [word for path in self.maps for word in ("--map", str(path.resolve()))]
+        return ["--set", str(self.folder / f"{node}.set"), *maps]
 
     @property
     def earlier_sets(self) -> list[Path]:
         """Sets of an earlier run in this folder."""
-        return sorted(self.folder.glob(self.set_file("*").name))
+        return sorted(self.folder.glob("*.set"))
 
 
 ROUTER_PATIENCE_S = 20.0  # time [s] within which the router reports its endpoint
@@ -121,11 +112,10 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
             from teamslam.team.keys.credentials import credentials_of
 
             own = credentials_of(plan.keys, "operator", team)
-        door = "".join(f" {word}" for word in plan.door)
         endpoint, connected = enter_team(
             router, lambda at: ZenohBus(team, at, keys=own, sheds=POSES)
         )
-        watch.place = f"--team {team} --connect {endpoint}{door}"
+        watch.place = " ".join(("--team", team, "--connect", endpoint, *plan.door))
         at = f'team="{team}", connect="{endpoint}"'
         watch.call = at if plan.keys is None else f'{at}, keys="{plan.keys}"'
         with connected as bus:
@@ -137,10 +127,10 @@ def launch(plan: Plan, show: Callable[[Watch], None]) -> Outcome:
                 for channel in LISTENS:
                     bus.subscribe(channel)
                 bus.watch_alive("central")
-            if plan.scenario.peers and own is not None:
-                from teamslam.team.keys.signing import Signer
+                if own is not None:
+                    from teamslam.team.keys.signing import Signer
 
-                watch.signer = Signer(own)
+                    watch.signer = Signer(own)
             for name, words in _commands(plan, resolved, endpoint):
                 start(name, words)
             supervise(services, bus, watch, show, plan.end_silent_s)
@@ -220,21 +210,12 @@ def _endpoint(service: Supervised) -> str:
 def _commands(plan: Plan, resolved: Path, endpoint: str) -> list[tuple[str, list[str]]]:
     common = [str(resolved), "--connect", endpoint, *plan.door]
     speed = "max" if plan.speed == float("inf") else repr(plan.speed)
-    robots = [
-        (f"robot-{r.id}", ["robot", *common, r.id, *plan.stores(r.id), *plan.maps_of(r.id)])
-        for r in plan.scenario.robots
-    ]
-    return [
-        (
-            "recorder",
-            ["record", *common, "--output", str(plan.log), "--resume", "--no-join"],
-        ),
-        *([] if plan.scenario.is_live else [("world", ["world", *common, "--speed", speed])]),
-        *(
-            [("central", ["central", *common, *plan.stores("central"), *plan.maps_of("central")])]
-            if plan.scenario.centre
-            else []
-        ),
-        *robots,
-        *([("viewer", ["viewer", *common])] if plan.views else []),
-    ]
+    recording = ["record", *common, "--output", str(plan.log), "--resume", "--no-join"]
+    commands = [("recorder", recording)]
+    if not plan.scenario.is_live:
+        commands.append(("world", ["world", *common, "--speed", speed]))
+    if plan.scenario.centre:
+        commands.append(("central", ["central", *common, *plan.fold_options("central")]))
+    ids = (each.id for each in plan.scenario.robots)
+    commands += [(f"robot-{i}", ["robot", *common, i, *plan.fold_options(i)]) for i in ids]
+    return commands + ([("viewer", ["viewer", *common])] if plan.views else [])

@@ -47,10 +47,10 @@ class Supervised:
     child: Child = field(init=False)
 
     def __post_init__(self) -> None:
-        self.child = self._start()
+        self._start()
 
-    def _start(self) -> Child:
-        return Child(self.name, self.arguments, self.folder, self.environment, self.restarts)
+    def _start(self) -> None:
+        self.child = Child(self.name, self.arguments, self.folder, self.environment, self.restarts)
 
     @property
     def is_watched(self) -> bool:
@@ -78,14 +78,11 @@ class Supervised:
             self.due = self.ended_s = None
             self.restarts += 1
             self.used = self.used.and_later(self.child.end(0.0).used)
-            self.child = Child(
-                self.name, self.arguments, self.folder, self.environment, self.restarts
-            )
+            self._start()
 
 
 SILENT_S = 10.0  # silence [s] after which a running process is reported
 FEW = 3  # above this number, silent processes are only counted
-COMPUTING = "is computing"
 MANY = "many"
 REPEAT_S = 60.0  # least time [s] between reports of the same silence
 STARTING_S = 60.0  # silence [s] after which a starting process is reported
@@ -117,12 +114,17 @@ def supervise(
 
     end_silent_s: silence [s] after which a process is ended, to be restarted.
     """
-    silence, memory = Silence(end_silent_s), Memory()
+    silence = Silence(end_silent_s)
     leaving: _Leaving | None = None
+    measure_s: float = -math.inf  # next measurement of memory; inf after the last
     while True:
         _receive(bus, watch)
         is_final = watch.is_over
-        memory.look(services, is_final=is_final)
+        now_s = time.monotonic()
+        if now_s >= measure_s or (is_final and measure_s < math.inf):
+            measure_s = math.inf if is_final else now_s + MEASURE_S
+            for service in services:
+                service.child.measure()
         for service in services:
             _look_after(service, bus, watch, is_final=is_final)
         if any(s.given_up and _is_needed(s.name, watch) for s in services):
@@ -206,22 +208,6 @@ def _end_who_stays(services: Sequence[Supervised], watch: Watch) -> None:
             )
 
 
-class Memory:
-    """Periodic measurement of memory, the last at the final map."""
-
-    def __init__(self) -> None:
-        self._due = 0.0
-        self._over = False
-
-    def look(self, services: Sequence[Supervised], *, is_final: bool) -> None:
-        """Measure if due."""
-        now = time.monotonic()
-        if (now >= self._due or is_final) and not self._over:
-            self._due, self._over = now + MEASURE_S, is_final
-            for service in services:
-                service.child.measure()
-
-
 class Silence:
     """Report of processes that send nothing."""
 
@@ -254,20 +240,14 @@ class Silence:
             if self._end_s is not None and silent_s >= self._end_s:
                 watch.note(f"{service.name} (pid {child.pid}) was silent {silent_s:.0f} s: ended")
                 child.kill()
-        self._tell(new, watch, now)
+        self._tell(new, watch)
 
-    def _tell(self, new: Sequence[tuple[Supervised, float]], watch: Watch, now: float) -> None:
+    def _tell(self, new: Sequence[tuple[Supervised, float]], watch: Watch) -> None:
         many = len(self._silent) > FEW
         for service, silent_s in new:
-            child = service.child
-            if child.is_stopped:
-                self._note(watch, service, "is stopped (SIGSTOP?)", silent_s)
-            elif not many and now >= self._last_note.get(service.name, -math.inf) + REPEAT_S:
-                self._last_note[service.name] = now
-                state = COMPUTING if child.is_computing else "is there"
-                self._note(watch, service, state, silent_s)
-        if many and new and now >= self._last_note.get(MANY, -math.inf) + REPEAT_S:
-            self._last_note[MANY] = now
+            if service.child.is_stopped or (not many and self._is_due(service.name)):
+                watch.note(_describe_silence(service, silent_s))
+        if many and new and self._is_due(MANY):
             named = ", ".join(service.name for service, _ in new[:FEW])
             watch.note(
                 f"{len(self._silent)} processes, {named} among them, have sent no message for "
@@ -275,17 +255,28 @@ class Silence:
                 "slower"
             )
 
-    @staticmethod
-    def _note(watch: Watch, service: Supervised, state: str, silent_s: float) -> None:
-        pid = service.child.pid
-        # End only a process that stands still, not a slow one.
-        stands_still = service.child.is_stopped or silent_s >= STARTING_S
-        restart = f". To have it started again: kill -9 {pid}"
-        remedy = restart if stands_still and state != COMPUTING else ""
-        watch.note(
-            f"{service.name} (pid {pid}) {state} and has sent no message for {silent_s:.0f} s: "
-            f"the team may wait for it{remedy}"
-        )
+    def _is_due(self, subject: str) -> bool:
+        now = time.monotonic()
+        due = now >= self._last_note.get(subject, -math.inf) + REPEAT_S
+        if due:
+            self._last_note[subject] = now
+        return due
+
+
+def _describe_silence(service: Supervised, silent_s: float) -> str:
+    """Describe a silent process; the remedy is to kill it only if it stands still."""
+    child = service.child
+    if child.is_stopped:
+        state, stands_still = "is stopped (SIGSTOP?)", True
+    elif child.is_computing:
+        state, stands_still = "is computing", False
+    else:
+        state, stands_still = "is there", silent_s >= STARTING_S
+    remedy = f". To have it started again: kill -9 {child.pid}" * stands_still
+    return (
+        f"{service.name} (pid {child.pid}) {state} and has sent no message for {silent_s:.0f} s: "
+        f"the team may wait for it{remedy}"
+    )
 
 
 def lacking_in(watch: Watch) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 
@@ -25,7 +25,7 @@ from teamslam.team.pairs import FEEDBACK
 from teamslam.team.saved_map import read_map
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, try_open
+from teamslam.team.wire.bus import Sample, open_valid
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of
 
@@ -74,9 +74,7 @@ def check_days(log: Samples, changes: Changes) -> None:
         return
     maps = [read_map(Path(path)) for path in changes.maps]
     found = set[str]()
-    for sample in log.samples([ch.SUBMAP]) if maps else ():
-        message = try_open(sample)
-        submap = None if message is None else message[2]
+    for _, _, submap in open_valid(log.samples([ch.SUBMAP]) if maps else ()):
         if not isinstance(submap, m.Submap) or submap.sequence or submap.robot in changes.without:
             continue
         first = digest_of(encoded(submap))
@@ -95,14 +93,7 @@ def _changed_scenario(scenario: Scenario, changes: Changes) -> Scenario:
         raise ScenarioError("a team without robots has nothing to compute")
     front = {"particles": changes.particles, "window_s": changes.window_s}
     front = {name: value for name, value in front.items() if value is not None}
-    noise = dict(changes.noise)
-    robots = tuple(
-        _with_noise(
-            msgspec.structs.replace(r, front_end=msgspec.structs.replace(r.front_end, **front)),
-            noise,
-        )
-        for r in robots
-    )
+    robots = tuple(_changed_robot(robot, front, dict(changes.noise)) for robot in robots)
     changed = with_options(
         msgspec.structs.replace(scenario, robots=robots),
         seed=changes.seed,
@@ -143,7 +134,10 @@ KINDS: Mapping[str, str] = MappingProxyType(
 """Kinds of noise, and the scaled parameters."""
 
 
-def _with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig:
+def _changed_robot(
+    robot: RobotConfig, front: Mapping[str, Any], factors: Mapping[str, float]
+) -> RobotConfig:
+    front_end = msgspec.structs.replace(robot.front_end, **front)
     motion = _motion(robot.motion, factors.get("odometry", 1.0))
     by_range = factors.get("range", 1.0)
     sensor: Sensor = msgspec.structs.replace(
@@ -152,7 +146,7 @@ def _with_noise(robot: RobotConfig, factors: Mapping[str, float]) -> RobotConfig
         range_sigma_per_m=robot.sensor.range_sigma_per_m * by_range,
         bearing_sigma=robot.sensor.bearing_sigma * factors.get("bearing", 1.0),
     )
-    return msgspec.structs.replace(robot, motion=motion, sensor=sensor)
+    return msgspec.structs.replace(robot, front_end=front_end, motion=motion, sensor=sensor)
 
 
 def _motion(motion: MotionModel, factor: float) -> MotionModel:

@@ -12,6 +12,7 @@ import numpy as np
 from teamslam.central.desk.evaluation.errors import interpolate_truth
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.results import Evaluation
+from teamslam.central.desk.export.take_home import seconds
 from teamslam.sim.datasets.factor_graph import (
     FactorGraph,
     Key,
@@ -37,8 +38,7 @@ from teamslam.team.estimation.se2 import compose
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import try_open
 
 FLOOR = np.diag((1e-4, 2e-3, 1e-4)) ** 2
 """Added to a singular covariance of a motion: without slip, or without motion."""
@@ -149,7 +149,8 @@ CHANNELS = (*ch.SENSORS, ch.TRUTH, ch.TRUTH_LANDMARKS)
 
 def export_utias(log: Log, folder: Path) -> list[str]:
     """Write the first incarnations, robots in the order of their numbers; raises LogError."""
-    messages = list(_sound(log))
+    opened = filter(None, map(try_open, log.samples(CHANNELS)))
+    messages = [message for _, _, message in opened]
     measurements = [each for each in messages if isinstance(each, m.Measurement)]
     robots = {each.robot for each in measurements if each.incarnation == FIRST_INCARNATION}
     if not robots:
@@ -177,14 +178,6 @@ def export_utias(log: Log, folder: Path) -> list[str]:
     return [stream.robot for stream in world.streams]
 
 
-def _sound(log: Log) -> Iterator[m.Message]:
-    for sample in log.samples(CHANNELS):
-        try:
-            yield opened(sample)[2]
-        except WireError:
-            continue  # every node rejects it, too; `teamslam log check` counts it
-
-
 LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"  # names of robots in pyfg, where L is a landmark's
 
 
@@ -204,15 +197,11 @@ def g2o_lines(graph: FactorGraph) -> Iterator[str]:
         first += 1  # a gap in the numbers, where no odometry leads from robot to robot
     for pose_edge in graph.pose_edges:
         ends = f"{vertex[pose_edge.start]} {vertex[pose_edge.end]}"
-        yield (
-            f"EDGE_SE2 {ends} {_numbers(pose_edge.motion)} "
-            f"{_upper(np.linalg.inv(pose_edge.covariance))}"
-        )
+        information = _upper(np.linalg.inv(pose_edge.covariance))
+        yield f"EDGE_SE2 {ends} {_numbers(pose_edge.motion)} {information}"
     for seen in graph.point_edges:
-        yield (
-            f"EDGE_SE2_XY {vertex[seen.pose]} {seen.landmark} {_numbers(seen.point)} "
-            f"{_upper(np.linalg.inv(seen.covariance))}"
-        )
+        ends = f"{vertex[seen.pose]} {seen.landmark}"
+        yield f"EDGE_SE2_XY {ends} {_numbers(seen.point)} {_upper(np.linalg.inv(seen.covariance))}"
 
 
 def isam_lines(graph: FactorGraph, robot: str) -> Iterator[str]:
@@ -228,10 +217,8 @@ def isam_lines(graph: FactorGraph, robot: str) -> Iterator[str]:
     for edge in graph.chain(robot)[1]:
         yield from seen_from.pop(edge.start, ())
         covariance = turn_covariance(edge.covariance, -edge.motion[2])
-        yield (
-            f"ODOMETRY {number[edge.start]} {number[edge.end]} {_numbers(edge.motion)} "
-            f"{_upper(_root(covariance))}"
-        )
+        ends = f"{number[edge.start]} {number[edge.end]}"
+        yield f"ODOMETRY {ends} {_numbers(edge.motion)} {_upper(_root(covariance))}"
     for rest in seen_from.values():
         yield from rest
 
@@ -247,25 +234,18 @@ def pyfg_lines(graph: FactorGraph) -> Iterator[str]:
         yield f"VERTEX_XY L{landmark} {_numbers(point)}"
     for key, (pose, covariance) in sorted(graph.priors.items()):
         if covariance is not None:
-            yield (
-                f"VERTEX_SE2:PRIOR {_time(graph, key)} {name[key]} {_numbers(pose)} "
-                f"{_upper(covariance)}"
-            )
+            placed = f"{_time(graph, key)} {name[key]} {_numbers(pose)}"
+            yield f"VERTEX_SE2:PRIOR {placed} {_upper(covariance)}"
     for edge in graph.pose_edges:
-        yield (
-            f"EDGE_SE2 {_time(graph, edge.end)} {name[edge.start]} {name[edge.end]} "
-            f"{_numbers(edge.motion)} {_upper(edge.covariance)}"
-        )
+        ends = f"{_time(graph, edge.end)} {name[edge.start]} {name[edge.end]}"
+        yield f"EDGE_SE2 {ends} {_numbers(edge.motion)} {_upper(edge.covariance)}"
     for seen in graph.point_edges:
-        yield (
-            f"EDGE_SE2_XY {_time(graph, seen.pose)} {name[seen.pose]} L{seen.landmark} "
-            f"{_numbers(seen.point)} {_upper(seen.covariance)}"
-        )
+        ends = f"{_time(graph, seen.pose)} {name[seen.pose]} L{seen.landmark}"
+        yield f"EDGE_SE2_XY {ends} {_numbers(seen.point)} {_upper(seen.covariance)}"
 
 
 def _time(graph: FactorGraph, key: Key) -> str:
-    whole, rest = divmod(graph.stamps_ns[key], 10**9)
-    return f"{whole}.{rest:09d}"
+    return seconds(graph.stamps_ns[key])
 
 
 def _root(covariance: Matrix) -> Matrix:

@@ -1,6 +1,6 @@
 """A world from a log."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
@@ -69,9 +69,8 @@ class RecordedWorld:
                 case m.Measurement() | m.Truth() if name in without:
                     pass
                 case m.Measurement():
-                    message = _without(message, without)
                     place = (message.robot, message.incarnation, message.number)
-                    out = Outgoing(channel, name, message)
+                    out = Outgoing(channel, name, _without(message, without))
                     published.setdefault(place, (message.stamp_ns, out))
                 case m.Truth():
                     truths.append((message.stamp_ns, Outgoing(channel, name, message)))
@@ -115,13 +114,11 @@ class RecordedWorld:
                     f"the estimator {scenario.estimator} needs a map of the landmarks, "
                     "and the log has none"
                 )
-            known = m.KnownMap(
-                stamp_ns=truth[0].stamp_ns, ids=truth[0].ids, positions=truth[0].positions
-            )
+            true = truth[0]
+            known = m.KnownMap(stamp_ns=true.stamp_ns, ids=true.ids, positions=true.positions)
             self._outgoing.append(Outgoing(ch.KNOWN_MAP, "", known))
-        self._outgoing.insert(
-            0, Outgoing(ch.WORLD_CONFIG, "", announce_configuration("world", 0, 0, scenario))
-        )
+        announced = announce_configuration("world", 0, 0, scenario)
+        self._outgoing.insert(0, Outgoing(ch.WORLD_CONFIG, "", announced))
 
     def begin(self) -> list[Outgoing]:
         """First messages: scenario, true landmarks, and known map."""
@@ -139,11 +136,8 @@ class RecordedWorld:
         if not self._waiting:
             self._ended = True
             self.now_ns = self.last_ns
-            out.append(
-                Outgoing(
-                    ch.END, "", m.End(stamp_ns=self.last_ns, streams=self._end, notes=self._notes)
-                )
-            )
+            end = m.End(stamp_ns=self.last_ns, streams=self._end, notes=self._notes)
+            out.append(Outgoing(ch.END, "", end))
         return out or self.publish(clock_s)
 
     def handle(self, message: m.Message) -> list[Outgoing]:
@@ -152,17 +146,17 @@ class RecordedWorld:
 
 
 def _ends(published: Collection[tuple[str, int, int]]) -> tuple[m.StreamEnd, ...]:
-    counts: dict[tuple[str, int], int] = {}
-    for robot, incarnation, measurement in sorted(published):
-        if measurement != counts.setdefault((robot, incarnation), 0):
+    counts = Counter[tuple[str, int]]()
+    last: dict[str, m.StreamEnd] = {}
+    for robot, incarnation, number in sorted(published):
+        count = counts[robot, incarnation]
+        if number != count:
             raise RerunError(
-                f"measurement {counts[robot, incarnation]} of {robot}, incarnation {incarnation} "
+                f"measurement {count} of {robot}, incarnation {incarnation} "
                 "is not in the log: under other conditions the robot could not go on behind it"
             )
         counts[robot, incarnation] += 1
-    last: dict[str, m.StreamEnd] = {}
-    for (robot, incarnation), count in sorted(counts.items()):
-        last[robot] = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count)
+        last[robot] = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=count + 1)
     return tuple(last.values())
 
 

@@ -27,7 +27,6 @@ import numpy as np
 
 from teamslam.central.desk.evaluation.errors import map_errors
 from teamslam.central.desk.evaluation.log import collect_log
-from teamslam.central.desk.evaluation.running import TrueLandmarks
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -36,8 +35,6 @@ from teamslam.sim.studies.experiments.true_minimum import final_fold
 from teamslam.sim.world.config import SimulatedWorld
 from teamslam.team.estimation.hybrid_slam import pipeline
 from teamslam.team.estimation.map_joining.marginals import landmark_map
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 
 PROFILES = ("thesis", "thesis-b", "random-5")
@@ -61,9 +58,7 @@ def joined(
 ) -> Figures:
     fold = final_fold(samples, is_robust=is_robust, has_biases=has_biases)
     ids, means, covariance = landmark_map(fold)
-    message = collect_log(samples).newest(ch.TRUTH_LANDMARKS, m.TruthLandmarks)
-    assert message is not None
-    truth = TrueLandmarks.of(message)
+    truth = collect_log(samples).true_landmarks
     places = dict(zip(truth.ids.tolist(), truth.positions, strict=True))
     found = map_errors(means, covariance, np.array([places[each] for each in ids.tolist()]))
     rmse = found.aligned_rmse_m if is_aligned else found.rmse_m

@@ -86,7 +86,7 @@ def association_result(log: Collected) -> AssociationResult | None:
     labels = _labels(log)
     if all(label == UNKNOWN for label in labels.values()):
         return None
-    final = log.newest(ch.FINAL_MAP, m.FusedMap)
+    final = log.final_map
     detections = list(_detections(log, labels))
     places = [place for _, place, _ in detections]
     # Without submaps, a place has the number of the estimator's own map.
@@ -96,13 +96,14 @@ def association_result(log: Collected) -> AssociationResult | None:
     local = _numbered(places)
     joined = _numbered([None if p is None else identity.get(p, p) for p in places])
     known = label != UNKNOWN
-    label_of, submaps = _majorities(label, places, identity)
+    votes, submaps = _votes(label, places, identity)
+    label_of = {number: _most_voted(of.values()) for number, of in votes.items()}
     several = len({place[:3] for place in identity}) > 1
     named = [number for number in label_of if label_of[number] != UNKNOWN]
     confirmed = [number for number in named if len(submaps[number]) > 1 or not several]
     decisions = () if final is None else final.decisions
     in_map = {*confirmed} if final is None else {*ids(final.ids, "ids").tolist()}
-    right, wrong = _merges(label, places, identity)
+    right, wrong = _merges(votes.values())
     return AssociationResult(
         pairs=_pairs(label[known], joined[known]),
         inside=_pairs(label[known], local[known], _numbered(windows)[known]),
@@ -203,34 +204,34 @@ def _choose_two(rows: Int64[np.ndarray, "n columns"]) -> int:
     return int((counts * (counts - 1) // 2).sum())
 
 
-def _majorities(
+Votes = Mapping[str, Counter[int]]
+"""Number of a landmark's detections by robot and label; a robot without labelled ones has none."""
+
+
+def _votes(
     label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
-) -> tuple[dict[int, int], dict[int, set[Place]]]:
-    votes: dict[int, Counter[int]] = {}
+) -> tuple[dict[int, Votes], dict[int, set[Place]]]:
+    votes: dict[int, dict[str, Counter[int]]] = {}
     submaps: dict[int, set[Place]] = {}
     for own, place in zip(label.tolist(), places, strict=True):
         if place is None or (number := identity.get(place)) is None:
             continue
-        votes.setdefault(number, Counter()).update([own] * (own != UNKNOWN))
+        of_robot = votes.setdefault(number, {}).setdefault(place[0], Counter())
+        of_robot.update([own] * (own != UNKNOWN))
         submaps.setdefault(number, set()).add((*place[:3], 0))
-    return {number: _most_voted(of) for number, of in votes.items()}, submaps
+    return {**votes}, submaps
 
 
-def _most_voted(votes: Counter[int]) -> int:
-    return max(sorted(votes), key=votes.__getitem__, default=UNKNOWN)
+def _most_voted(votes: Iterable[Counter[int]]) -> int:
+    total = sum(votes, Counter[int]())
+    return max(sorted(total), key=total.__getitem__, default=UNKNOWN)
 
 
-def _merges(
-    label: Int64[np.ndarray, " n"], places: list[Place | None], identity: Mapping[Place, int]
-) -> tuple[int, int]:
-    votes: dict[int, dict[str, Counter[int]]] = {}
-    for own, place in zip(label.tolist(), places, strict=True):
-        if place is None or (number := identity.get(place)) is None or own == UNKNOWN:
-            continue
-        votes.setdefault(number, {}).setdefault(place[0], Counter())[own] += 1
+def _merges(votes: Iterable[Votes]) -> tuple[int, int]:
+    """Pairs of robots that share landmarks, at least half of which agree by label, and others."""
     agreed: dict[tuple[str, str], list[bool]] = {}
-    for by_robot in votes.values():
-        best = {robot: _most_voted(of) for robot, of in by_robot.items()}
+    for by_robot in votes:
+        best = {robot: _most_voted([of]) for robot, of in by_robot.items() if of}
         for a, b in combinations(sorted(best), 2):
             agreed.setdefault((a, b), []).append(best[a] == best[b])
     right = sum(2 * sum(each) >= len(each) for each in agreed.values())

@@ -1,6 +1,6 @@
 """Errors against the truth: distances, headings, NEES, alignment."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +8,14 @@ import numpy as np
 from teamslam.team.estimation.consistency import chi2_interval, coverage, nees
 from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.map_joining.alignment import NEEDED, procrustes
-from teamslam.team.estimation.se2 import between
+from teamslam.team.estimation.se2 import Pose, between
 from teamslam.team.shapes import Bool, Float, Int64
 
+Points = Float[np.ndarray, "n 2"]  # (x [m], y [m])
+Poses = Float[np.ndarray, "K 3"]  # (x [m], y [m], theta [rad])
+PoseCovariances = Float[np.ndarray, "K 3 3"]
+Covariance = Float[np.ndarray, "m m"]  # of points, (x0, y0, x1, y1, …) [m²]
+Stamps = Int64[np.ndarray, " K"]
 TRUTH_GAP_NS = 1_000_000_000  # largest gap between truth samples that is interpolated
 BAND = 0.95
 
@@ -19,8 +24,8 @@ BAND = 0.95
 class Path:
     """Poses (x [m], y [m], theta [rad]) by ascending stamp."""
 
-    stamps_ns: Int64[np.ndarray, " K"]
-    poses: Float[np.ndarray, "K 3"]
+    stamps_ns: Stamps
+    poses: Poses
 
 
 def join_batches(batches: Sequence[Path]) -> Path:
@@ -42,9 +47,9 @@ class PoseErrors:
     nees: eᵀ P⁻¹ e with 3 degrees of freedom. motion_nees: of the motion from estimate to truth.
     """
 
-    stamps_ns: Int64[np.ndarray, " K"]
-    errors: Float[np.ndarray, "K 3"]
-    sigmas: Float[np.ndarray, "K 3"]
+    stamps_ns: Stamps
+    errors: Poses
+    sigmas: Poses
     nees: Float[np.ndarray, " K"]
     motion_nees: Float[np.ndarray, " K"]
 
@@ -81,7 +86,7 @@ class MapErrors:
     count: int
     rmse_m: float
     aligned_rmse_m: float | None
-    truth_from_map: Float[np.ndarray, "3"] | None
+    truth_from_map: Pose | None
     nees_per_dof: float
     band: tuple[float, float]
     shape: "ShapeErrors | None"
@@ -116,17 +121,11 @@ def rms(values: Float[np.ndarray, " n"]) -> float:
 
 def on_circle(angles: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Wrap angles to (−π, π]."""
-    wrapped: Float[np.ndarray, "*n"] = angles + 2.0 * np.pi * np.floor(
-        (np.pi - angles) / (2.0 * np.pi)
-    )
-    return wrapped
+    turns: Float[np.ndarray, "*n"] = np.floor((np.pi - angles) / (2.0 * np.pi))
+    return angles + 2.0 * np.pi * turns
 
 
-def map_errors(
-    means: Float[np.ndarray, "L 2"],
-    covariance: Float[np.ndarray, "m m"],
-    truth: Float[np.ndarray, "L 2"],
-) -> MapErrors:
+def map_errors(means: Points, covariance: Covariance, truth: Points) -> MapErrors:
     """Errors of L ≥ 1 landmarks with 2L × 2L covariance."""
     count = len(means)
     difference = means - truth
@@ -134,7 +133,7 @@ def map_errors(
     return MapErrors(
         count=count,
         rmse_m=distance_rmse(means, truth),
-        aligned_rmse_m=_moved_rmse(motion, means, truth),
+        aligned_rmse_m=moved_rmse(motion, means, truth),
         truth_from_map=motion,
         nees_per_dof=nees(difference.ravel(), covariance) / (2 * count),
         band=chi2_interval(2 * count, BAND, 1),
@@ -144,10 +143,10 @@ def map_errors(
 
 
 def _shape_errors(
-    means: Float[np.ndarray, "L 2"],
-    covariance: Float[np.ndarray, "m m"],
-    truth: Float[np.ndarray, "L 2"],
-    truth_from_map: Float[np.ndarray, "3"],
+    means: Points,
+    covariance: Covariance,
+    truth: Points,
+    truth_from_map: Pose,
 ) -> ShapeErrors:
     """With G = ∂(positions)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g).
 
@@ -170,7 +169,7 @@ def _shape_errors(
     )
 
 
-def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m m"]) -> float:
+def _covered(errors: Points, covariance: Covariance) -> float:
     count = len(errors)
     blocks = covariance.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count), :]
     # Two landmarks have a one-dimensional shape, so their blocks are singular.
@@ -179,42 +178,39 @@ def _covered(errors: Float[np.ndarray, "L 2"], covariance: Float[np.ndarray, "m 
     return coverage(squared, np.linalg.matrix_rank(blocks, hermitian=True).astype(float), BAND)
 
 
-def rigid_alignment(
-    truth: Float[np.ndarray, "n 2"], points: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "3"] | None:
+def rigid_alignment(truth: Points, points: Points) -> Pose | None:
     """truth_from_points by least squares (Umeyama 1991); None below two points."""
     if len(points) < NEEDED or np.ptp(points, axis=0).max() == 0.0:
         return None
     return procrustes(truth, points, np.ones(len(points)))
 
 
-def transform_points(
-    a_from_b: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n 2"]:
+def transform_points(a_from_b: Pose, points: Points) -> Points:
     """Transform points from frame b to a."""
     c, s = np.cos(a_from_b[2]), np.sin(a_from_b[2])
-    turned: Float[np.ndarray, "n 2"] = points @ np.array([[c, s], [-s, c]])
+    turned: Points = points @ np.array([[c, s], [-s, c]])
     turned += a_from_b[:2]
     return turned
 
 
-def distance_rmse(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "n 2"]) -> float:
+def distance_rmse(a: Points, b: Points) -> float:
     """RMS distance between corresponding rows [m]."""
     difference = a - b
     return rms(np.hypot(difference[:, 0], difference[:, 1]))
 
 
-def _moved_rmse(
-    motion: Float[np.ndarray, "3"] | None,
-    points: Float[np.ndarray, "n 2"],
-    truth: Float[np.ndarray, "n 2"],
+def moved_rmse(
+    motion: Pose | None,
+    points: Float[np.ndarray, "n k"],
+    truth: Float[np.ndarray, "n k"],
 ) -> float | None:
-    return None if motion is None else distance_rmse(transform_points(motion, points), truth)
+    """RMS distance [m] of the first two columns after a motion, if there is one, and points."""
+    if motion is None or not len(points):
+        return None
+    return distance_rmse(transform_points(motion, points[:, :2]), truth[:, :2])
 
 
-def interpolate_truth(
-    truth: Path, stamps_ns: Int64[np.ndarray, " K"]
-) -> tuple[Float[np.ndarray, "K 3"], Bool[np.ndarray, " K"]]:
+def interpolate_truth(truth: Path, stamps_ns: Stamps) -> tuple[Poses, Bool[np.ndarray, " K"]]:
     """Interpolate the true poses at the stamps; return poses and a mask of known rows.
 
     Headings by the shorter arc; unknown outside the truth and in gaps above TRUTH_GAP_NS.
@@ -238,9 +234,7 @@ def interpolate_truth(
     return poses, known
 
 
-def pose_errors(
-    path: Path, covariances: Float[np.ndarray, "K 3 3"], truth: Path
-) -> PoseErrors | None:
+def pose_errors(path: Path, covariances: PoseCovariances, truth: Path) -> PoseErrors | None:
     """Errors of the poses with truth; None without any."""
     true_poses, known = interpolate_truth(truth, path.stamps_ns)
     if not known.any():
@@ -258,9 +252,7 @@ def pose_errors(
     )
 
 
-def _motion_nees(
-    poses: Float[np.ndarray, "K 3"], truth: Float[np.ndarray, "K 3"], P: Float[np.ndarray, "K 3 3"]
-) -> Float[np.ndarray, " K"]:
+def _motion_nees(poses: Poses, truth: Poses, P: PoseCovariances) -> Float[np.ndarray, " K"]:
     """ξᵀ (A P Aᵀ)⁻¹ ξ with truth = Exp(ξ) ∘ pose, which allows for rotation about a far point.
 
     ξ = (V⁻¹ (p' − R p), δ) with V of the SE(2) exponential; A = [1 0 y; 0 1 −x; 0 0 1].
@@ -302,6 +294,16 @@ def associate_truth(path: Path, truth: Path) -> tuple[Path, Path]:
     return Path(stamps, path.poses[known]), Path(stamps, poses[known])
 
 
+def align_paths(paths: Iterable[tuple[Path, Path]]) -> Pose | None:
+    """truth_from_map that aligns paths with the true ones; None below two places."""
+    pairs = [associate_truth(*pair) for pair in paths]
+    places, true = (
+        np.concatenate([np.empty((0, 2)), *(pair[k].poses[:, :2] for pair in pairs)])
+        for k in (0, 1)
+    )
+    return rigid_alignment(true, places)
+
+
 def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
     """Errors of a path; None without truth."""
     estimate, true = (each.poses for each in associate_truth(path, truth))
@@ -314,14 +316,14 @@ def trajectory_errors(path: Path, truth: Path) -> TrajectoryErrors | None:
         len(estimate),
         distance_rmse(estimate[:, :2], true[:, :2]),
         rms(turned),
-        _moved_rmse(motion, estimate[:, :2], true[:, :2]),
+        moved_rmse(motion, estimate, true),
         None if motion is None else rms(on_circle(turned + motion[2])),
         rms(np.hypot(relative[:, 0], relative[:, 1])) if len(relative) else None,
         rms(relative[:, 2]) if len(relative) else None,
     )
 
 
-def _relative(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def _relative(a: Poses, b: Poses) -> Poses:
     dx, dy = (b[:, :2] - a[:, :2]).T
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.column_stack((c * dx + s * dy, c * dy - s * dx, on_circle(b[:, 2] - a[:, 2])))

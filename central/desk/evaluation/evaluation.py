@@ -2,7 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -10,7 +11,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
-from teamslam.central.config import UNREADABLE, TeamConfig, team_config
+from teamslam.central.config import UNREADABLE
 from teamslam.central.desk.evaluation.association import association_result
 from teamslam.central.desk.evaluation.clocks import (
     Late,
@@ -22,11 +23,12 @@ from teamslam.central.desk.evaluation.clocks import (
 from teamslam.central.desk.evaluation.errors import (
     MapErrors,
     Path,
-    distance_rmse,
-    interpolate_truth,
+    Points,
+    align_paths,
+    associate_truth,
     map_errors,
+    moved_rmse,
     pose_errors,
-    rigid_alignment,
     transform_points,
 )
 from teamslam.central.desk.evaluation.log import Collected, collect_log
@@ -38,14 +40,14 @@ from teamslam.central.desk.evaluation.results import (
     PeerResult,
     RobotResult,
 )
-from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.evaluation.states import robot_states, verdicts_given
 from teamslam.central.desk.left_out import describe_spans, is_kept, spans_left_out
 from teamslam.central.desk.names import data_set_of, in_order
 from teamslam.central.diagnosis import contradicts
 from teamslam.team import translate
-from teamslam.team.config import SURVEY_FRAME, UNNAMED, RobotConfig
+from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.se2 import Pose
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.check import MOST_HOLES, holes
@@ -64,52 +66,30 @@ UPLINK = {
 """Channels of each uplink name in `PAIRS`."""
 
 
-TeamMotion = tuple[Float[np.ndarray, "3"], str]
+TeamMotion = tuple[Pose, str]
 """Rigid motion from map to truth, and the aligned points or paths."""
 
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
     """Evaluate one run from its samples."""
     log = collect_log(samples)
-    world, scenario = log.newest(ch.WORLD_CONFIG, m.Configuration), None
-    if world is not None:
-        with suppress(ValueError):
-            scenario = team_config(world.configuration)
-    truth = log.newest(ch.TRUTH_LANDMARKS, m.TruthLandmarks)
-    true = TrueLandmarks() if truth is None else TrueLandmarks.of(truth)
     association = association_result(log)
-    label_of = {} if association is None else association.label_of
-    message = log.newest(ch.FINAL_MAP, m.FusedMap)
-    frames = TruthFrames()
-    for start in log.of_all(ch.START, m.InitialPose):
-        frames.take(start)
-    arbitrary = _is_arbitrary(frames, message)
-
-    def is_in_frame(frame: str) -> bool:
-        if not arbitrary:
-            return frames.has(frame)
-        return message is None or not message.ids or frame in {"", message.frame}
-
-    causes = () if message is None else message.diagnosis
-    robots = {}
-    for robot in log.robots:
-        uplink = _uplink_bytes(log, scenario, robot)
-        own_map = _own_map(log, robot, true)
-        robots[robot] = _robot_result(log, robot, uplink, own_map, is_in_frame, causes)
-    truth_from_map = _motion(robots.values()) if arbitrary else np.zeros(3)
+    robots = {robot: _robot_result(log, robot) for robot in log.robots}
     fused = None
-    if message is not None:
-        fused = _map_result(log, message, true, label_of, truth_from_map, arbitrary=arbitrary)
+    if log.final_map is not None:
+        label_of = {} if association is None else association.label_of
+        truth_from_map = _align_robots(robots.values()) if log.is_arbitrary else np.zeros(3)
+        fused = _map_result(log, log.final_map, label_of, truth_from_map)
     motion = _team_motion(fused, robots.values())
     robots = {name: _aligned(robot, motion) for name, robot in robots.items()}
-    end = log.newest(ch.END, m.End)
+    end, world = log.newest(ch.END, m.End), log.newest(ch.WORLD_CONFIG, m.Configuration)
     faults = log.of_all(ch.FAULT, m.Fault)
     mirrored, late, separate_times = _examine_streams(log)
     return Evaluation(
-        scenario=scenario,
+        scenario=log.scenario,
         map=fused,
         robots=robots,
-        true_landmarks=true.positions,
+        true_landmarks=log.true_landmarks.positions,
         channels={key: log.traffic[key] for key in in_order(log.traffic)},
         notes=(
             *(() if end is None else end.notes),
@@ -122,15 +102,13 @@ def evaluate(samples: Iterable[Sample]) -> Evaluation:
         cost_by_robot=log.figures("central", "joint_cost_per_dof."),
         faults=len(faults),
         scale_by_robot=log.figures("central", "covariance_scale."),
-        arbitrary_frame=arbitrary,
+        arbitrary_frame=log.is_arbitrary,
         truth_from_map=None if motion is None else motion[0],
         peers=_peer_results(log),
         disagreement=log.disagreement,
         association=association,
-        decisions=() if message is None else message.decisions,
-        states=robot_states(
-            log, message, () if scenario is None else [each.id for each in scenario.robots]
-        ),
+        decisions=() if log.final_map is None else log.final_map.decisions,
+        states=robot_states(log),
         verdicts=verdicts_given(log),
         data_set="" if world is None else data_set_of(world.configuration),
         gps_median_m=_gps_median(log, {name: each.smoothed_path for name, each in robots.items()}),
@@ -172,14 +150,6 @@ def _config(log: Collected, robot: str) -> RobotConfig:
     return RobotConfig(robot)
 
 
-def _is_arbitrary(frames: TruthFrames, fused: m.FusedMap | None) -> bool:
-    if fused is None or not fused.members:
-        return frames.none_is_known
-    if fused.frame == SURVEY_FRAME:
-        return False
-    return not any(frames.has(translate.frame_name(x.robot, x.incarnation)) for x in fused.members)
-
-
 def _warn_of_missing(log: Collected) -> list[str]:
     warnings = []
     for robot in log.robots:
@@ -194,14 +164,12 @@ def _warn_of_missing(log: Collected) -> list[str]:
 
 
 def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
-    by_node: dict[str, list[m.Fault]] = {}
-    for fault in faults:
-        by_node.setdefault(fault.node, []).append(fault)
+    counts = Counter(fault.node for fault in faults)
+    first = {fault.node: fault for fault in reversed(faults)}
     return [
-        f"{node} set {len(by_node[node])} messages aside; the first, {first.origin}, raised "
-        f"{first.error} at {first.place}: {first.text}"
-        for node in in_order(by_node)
-        for first in by_node[node][:1]
+        f"{node} set {counts[node]} messages aside; the first, {first[node].origin}, raised "
+        f"{first[node].error} at {first[node].place}: {first[node].text}"
+        for node in in_order(counts)
     ]
 
 
@@ -217,7 +185,8 @@ def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
     return replace(evaluation, notes=(*evaluation.notes, *lost))
 
 
-def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | None:
+def _uplink_bytes(log: Collected, robot: str) -> int | None:
+    team = log.scenario
     named = None if team is None else PAIRS.get((team.estimator, team.fusion))
     if named is None:
         return None
@@ -226,24 +195,18 @@ def _uplink_bytes(log: Collected, team: TeamConfig | None, robot: str) -> int | 
 
 
 def _aligned(robot: RobotResult, team_motion: TeamMotion | None) -> RobotResult:
-    motion, alignment = team_motion or (_motion([robot]), "trajectory")
-    aligned = None if motion is None else _moved_rmse(motion, robot.smoothed_path, robot.truth)
-    online = None
-    if team_motion is not None:
-        online = _moved_rmse(team_motion[0], robot.online_path, robot.truth)
+    smoothed, online = (
+        [path.poses for path in associate_truth(path, robot.truth)]
+        for path in (robot.smoothed_path, robot.online_path)
+    )
+    motion, alignment = team_motion or (_align_robots([robot]), "trajectory")
+    aligned = moved_rmse(motion, *smoothed)
     return replace(
         robot,
         aligned_rmse_m=aligned,
         alignment=None if aligned is None else alignment,
-        online_aligned_rmse_m=online,
+        online_aligned_rmse_m=team_motion and moved_rmse(team_motion[0], *online),
     )
-
-
-def _moved_rmse(motion: Float[np.ndarray, "3"], path: Path, truth: Path) -> float | None:
-    true_poses, known = interpolate_truth(truth, path.stamps_ns)
-    if not known.any():
-        return None
-    return distance_rmse(transform_points(motion, path.poses[known, :2]), true_poses[known, :2])
 
 
 def _team_motion(fused: MapResult | None, robots: Iterable[RobotResult]) -> TeamMotion | None:
@@ -251,17 +214,12 @@ def _team_motion(fused: MapResult | None, robots: Iterable[RobotResult]) -> Team
         return None
     if fused.errors is not None and fused.errors.truth_from_map is not None:
         return fused.errors.truth_from_map, "map"
-    motion = _motion(robots)
+    motion = _align_robots(robots)
     return None if motion is None else (motion, "paths")
 
 
-def _motion(robots: Iterable[RobotResult]) -> Float[np.ndarray, "3"] | None:
-    true_places, places = [np.empty((0, 2))], [np.empty((0, 2))]
-    for robot in robots:
-        truth, known = interpolate_truth(robot.truth, robot.smoothed_path.stamps_ns)
-        true_places.append(truth[known, :2])
-        places.append(robot.smoothed_path.poses[known, :2])
-    return rigid_alignment(np.concatenate(true_places), np.concatenate(places))
+def _align_robots(robots: Iterable[RobotResult]) -> Pose | None:
+    return align_paths((robot.smoothed_path, robot.truth) for robot in robots)
 
 
 LEAST = 10
@@ -336,12 +294,10 @@ def distances(
 def _map_result(
     log: Collected,
     message: m.FusedMap,
-    true: TrueLandmarks,
     label_of: Mapping[int, int],
-    truth_from_map: Float[np.ndarray, "3"] | None,
-    *,
-    arbitrary: bool,
+    truth_from_map: Pose | None,
 ) -> MapResult:
+    true = log.true_landmarks
     ids, means = translate.landmarks_of(message)
     covariance = translate.landmark_covariance_of(message)
     labels = np.array([label_of.get(i, i) for i in ids.tolist()], np.uint32)
@@ -373,7 +329,7 @@ def _map_result(
         diagnosis=tuple(
             _name_points(log, each)
             for each in message.diagnosis
-            if not _is_refuted(each, errors, arbitrary=arbitrary)
+            if not _is_refuted(each, errors, arbitrary=log.is_arbitrary)
         ),
         joined=message.joined,
         covariance_scale=message.covariance_scale or None,
@@ -403,7 +359,7 @@ def _is_refuted(found: m.Diagnosis, errors: MapErrors | None, *, arbitrary: bool
 
 
 def _gospa(
-    means: Float[np.ndarray, "L 2"], errors: MapErrors | None, positions: Float[np.ndarray, "T 2"]
+    means: Points, errors: MapErrors | None, positions: Float[np.ndarray, "T 2"]
 ) -> Gospa | None:
     cut_off_m = half_spacing(positions)
     if errors is None or errors.truth_from_map is None or not cut_off_m:
@@ -411,20 +367,17 @@ def _gospa(
     return gospa(transform_points(errors.truth_from_map, means), positions, cut_off_m)
 
 
-def _own_map(log: Collected, robot: str, true: TrueLandmarks) -> MapErrors | None:
+def _own_map(log: Collected, robot: str) -> MapErrors | None:
     message = log.newest(ch.OWN_MAP, m.MapEstimate, robot)
     if message is None:
         return None
     ids, means = translate.landmarks_of(message)
-    truth, known = true.match(ids)
+    truth, known = log.true_landmarks.match(ids)
     return _errors(means, translate.landmark_covariance_of(message), truth, known)
 
 
 def _errors(
-    means: Float[np.ndarray, "L 2"],
-    covariance: Matrix,
-    truth: Float[np.ndarray, "L 2"],
-    known: Bool[np.ndarray, " L"],
+    means: Points, covariance: Matrix, truth: Points, known: Bool[np.ndarray, " n"]
 ) -> MapErrors | None:
     rows = np.flatnonzero(np.repeat(known, 2))
     if not known.any():
@@ -432,14 +385,7 @@ def _errors(
     return map_errors(means[known], covariance[np.ix_(rows, rows)], truth[known])
 
 
-def _robot_result(
-    log: Collected,
-    robot: str,
-    uplink_bytes: int | None,
-    own_map: MapErrors | None,
-    is_in_frame: Callable[[str], bool],
-    causes: Sequence[m.Diagnosis],
-) -> RobotResult:
+def _robot_result(log: Collected, robot: str) -> RobotResult:
     trajectories = log.messages(ch.TRAJECTORY, m.Trajectory, robot)
     truths = log.messages(ch.TRUTH, m.Truth, robot)
     truth, _ = _stack_paths([translate.trajectory_of(t) for t in truths], [])
@@ -447,6 +393,7 @@ def _robot_result(
         [translate.trajectory_of(t) for t in trajectories],
         [floats(t.covariances, "covariances") for t in trajectories],
     )
+    causes = () if log.final_map is None else log.final_map.diagnosis
     left_out = spans_left_out(causes, robot, smoothed.stamps_ns.tolist())
     kept = is_kept(smoothed.stamps_ns, left_out)
     smoothed = Path(smoothed.stamps_ns[kept], smoothed.poses[kept])
@@ -455,7 +402,7 @@ def _robot_result(
     online_channel, estimates, outside = None, [], False
     for channel in (ch.TEAM_POSE, ch.CENTRAL_POSE, ch.OWN_POSE):
         poses = log.messages(channel, m.PoseEstimate, robot)
-        estimates = [p for p in poses if is_in_frame(p.frame)]
+        estimates = [p for p in poses if log.is_in_frame(p.frame)]
         outside = outside or bool(poses)
         if estimates:
             of = channel.template.removeprefix("robot/{robot}/").removesuffix("/{robot}")
@@ -467,14 +414,14 @@ def _robot_result(
     )
     return RobotResult(
         consumption=_consumption(log, robot),
-        uplink_bytes=uplink_bytes,
+        uplink_bytes=_uplink_bytes(log, robot),
         truth=truth,
         smoothed_path=smoothed,
         smoothed=pose_errors(smoothed, smoothed_covariances, truth),
         online_path=online,
         online=pose_errors(online, online_covariances, truth),
         online_channel=online_channel,
-        own_map=own_map,
+        own_map=_own_map(log, robot),
         outside=outside,
         left_out=left_out,
     )
@@ -483,10 +430,10 @@ def _robot_result(
 def _consumption(log: Collected, robot: str) -> Consumption:
     dones = {d.incarnation: d for d in log.messages(ch.ROBOT_DONE, m.Done, robot)}
     submaps = {(s.incarnation, s.sequence): s for s in log.messages(ch.SUBMAP, m.Submap, robot)}
-    ledger: dict[str, int] = {}
+    ledger = Counter[str]()
     for incarnation in sorted(dones):
         for entry in dones[incarnation].ledger:
-            ledger[entry.disposition] = ledger.get(entry.disposition, 0) + entry.measurements
+            ledger[entry.disposition] += entry.measurements
     measurements = log.measurements.get(robot, {})
     consumed = sum(d.measurements for d in dones.values()) if dones else None
     are_disjoint = all(
@@ -507,11 +454,10 @@ def _consumption(log: Collected, robot: str) -> Consumption:
 def _stack_paths(
     parts: Sequence[tuple[np.ndarray, np.ndarray]], covariances: Sequence[np.ndarray]
 ) -> tuple[Path, Float[np.ndarray, "K 3 3"]]:
+    """Join by stamp; the last of equal stamps counts."""
     stamps = np.concatenate([np.empty(0, np.int64), *(stamps for stamps, _ in parts)])
     poses = np.concatenate([np.empty((0, 3)), *(poses for _, poses in parts)])
-    order = np.argsort(stamps, kind="stable")
-    last = np.flatnonzero(np.append(np.diff(stamps[order]) != 0, [True] * (len(stamps) > 0)))
-    chosen = order[last]
+    chosen = len(stamps) - 1 - np.unique(stamps[::-1], return_index=True)[1]
     flat = np.concatenate([np.empty(0), *covariances]).reshape(-1, 3, 3)
     return Path(stamps[chosen], poses[chosen]), flat[chosen] if len(flat) else flat
 

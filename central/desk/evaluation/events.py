@@ -70,18 +70,15 @@ class EventDetector:
                 before = self._incarnations.get(message.robot, FIRST)
                 self._incarnations[message.robot] = max(before, message.incarnation)
                 if message.incarnation > before:
-                    text = (
-                        f"the stream of {message.robot} begins anew, incarnation "
-                        f"{message.incarnation}"
-                    )
-                    yield "restarted", robot_node(message.robot), text
-            case m.Done() if robot_node(message.robot) not in self._done:
-                self._done.add(robot_node(message.robot))
+                    text = f"the stream of {message.robot} begins anew, incarnation "
+                    yield "restarted", robot_node(message.robot), f"{text}{message.incarnation}"
+            case m.Done() if (node := robot_node(message.robot)) not in self._done:
+                self._done.add(node)
                 text = (
                     f"{message.robot} has taken all its {message.measurements:,} measurements, "
                     f"{message.submaps} submaps"
                 )
-                yield "done", robot_node(message.robot), text
+                yield "done", node, text
             case m.End() if not self._ended:
                 self._ended = True
                 for note in message.notes:

@@ -7,11 +7,16 @@ from collections import defaultdict
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TypeVar
 
+from teamslam.central.config import TeamConfig, team_config
 from teamslam.central.desk.evaluation.clocks import Timed
+from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre, as_centre_final
+from teamslam.team import translate
+from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.recording.inventory import numbered_in
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -74,6 +79,48 @@ class Collected:
         return in_order(
             self.measurements.keys() | {name for channel, name in found if channel in _OF_A_ROBOT}
         )
+
+    @cached_property
+    def scenario(self) -> TeamConfig | None:
+        """Scenario of the world, if this version can read it."""
+        world = self.newest(ch.WORLD_CONFIG, m.Configuration)
+        with suppress(ValueError):
+            return None if world is None else team_config(world.configuration)
+        return None
+
+    @cached_property
+    def final_map(self) -> m.FusedMap | None:
+        """Final map, if any."""
+        return self.newest(ch.FINAL_MAP, m.FusedMap)
+
+    @cached_property
+    def true_landmarks(self) -> TrueLandmarks:
+        """True landmarks; none if unknown."""
+        truth = self.newest(ch.TRUTH_LANDMARKS, m.TruthLandmarks)
+        return TrueLandmarks() if truth is None else TrueLandmarks.of(truth)
+
+    @cached_property
+    def _frames(self) -> TruthFrames:
+        frames = TruthFrames()
+        for start in self.of_all(ch.START, m.InitialPose):
+            frames.take(start)
+        return frames
+
+    @cached_property
+    def is_arbitrary(self) -> bool:
+        """Whether neither a known initial pose nor a survey fixes the final map's frame."""
+        fused = self.final_map
+        if fused is None or not fused.members:
+            return self._frames.none_is_known
+        names = (translate.frame_name(x.robot, x.incarnation) for x in fused.members)
+        return fused.frame != SURVEY_FRAME and not any(map(self._frames.has, names))
+
+    def is_in_frame(self, frame: str) -> bool:
+        """Whether a frame has truth; if the final map's is arbitrary, whether it is that."""
+        if not self.is_arbitrary:
+            return self._frames.has(frame)
+        fused = self.final_map
+        return fused is None or not fused.ids or frame in {"", fused.frame}
 
     def newest(self, channel: Channel, kind: type[M], name: str = "") -> M | None:
         """Newest valid message of a channel."""

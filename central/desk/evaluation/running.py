@@ -11,6 +11,7 @@ from teamslam.central.desk.evaluation.errors import (
     BAND,
     Path,
     PoseErrors,
+    align_paths,
     distance_rmse,
     interpolate_truth,
     join_batches,
@@ -21,6 +22,7 @@ from teamslam.central.fused_map import START_POSES
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.estimation.consistency import chi2_quantile, nees
+from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
@@ -238,13 +240,10 @@ class TruthAlignment:
         ids, means = translate.landmarks_of(fused)
         true, known = self.landmarks.match(ids)
         motion = rigid_alignment(means[known], true[known])
-        return self._align_paths() if motion is None else motion
-
-    def _align_paths(self) -> Float[np.ndarray, "3"] | None:
-        places, true_places = [np.empty((0, 2))], [np.empty((0, 2))]
-        for (robot, _, _), path in self._smoothed.items():
-            truth = join_batches(self._truth.get(robot, []))
-            poses, known = interpolate_truth(truth, path.stamps_ns)
-            places.append(path.poses[known, :2])
-            true_places.append(poses[known, :2])
-        return rigid_alignment(np.concatenate(places), np.concatenate(true_places))
+        if motion is not None:
+            return motion
+        motion = align_paths(
+            (path, join_batches(self._truth.get(robot, [])))
+            for (robot, _, _), path in self._smoothed.items()
+        )
+        return None if motion is None else inverse(motion)

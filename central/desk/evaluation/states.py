@@ -27,12 +27,12 @@ class RobotState(NamedTuple):
     why: str = ""
 
 
-def robot_states(
-    log: "Collected", fused: m.FusedMap | None, robots: Collection[str]
-) -> dict[str, RobotState]:
+def robot_states(log: "Collected") -> dict[str, RobotState]:
     """State of every robot, and of saved maps as `map-<name>`."""
+    fused = log.final_map
     if fused is None:
         return {}
+    robots = [] if log.scenario is None else [each.id for each in log.scenario.robots]
     members = {member.robot for member in fused.members}
     team = {*robots, *log.robots, *fused.withdrawn, *fused.lost, *members}
     if not members and fused.rule != "join":
@@ -141,8 +141,7 @@ def verdicts_given(log: "Collected") -> tuple[str, ...]:
     keys = [key for key in log.samples if ch.row_of(key) is ch.VERDICT]
     samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
     given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]
-    final = log.newest(ch.FINAL_MAP, m.FusedMap)
-    rests_on = () if final is None else final.verdicts
+    rests_on = () if log.final_map is None else log.final_map.verdicts
     return tuple(_words(each, rests_on) for each in given)
 
 

@@ -13,7 +13,12 @@ from teamslam.central.desk.drawing import (
     robot_colours,
 )
 from teamslam.central.desk.evaluation.results import Evaluation
-from teamslam.central.desk.pictures.run import in_the_maps_frame, magnification, new_figure
+from teamslam.central.desk.pictures.run import (
+    in_the_maps_frame,
+    magnification,
+    new_figure,
+    set_grid,
+)
 from teamslam.team import translate
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
@@ -106,8 +111,7 @@ def _begin_frame(
     axis.set_aspect("equal")
     axis.set_xlim(middle[0] - half, middle[0] + half)
     axis.set_ylim(middle[1] - half, middle[1] + half)
-    axis.grid(color="#e4e4e4", linewidth=0.6)
-    axis.set_axisbelow(True)
+    set_grid(axis, "#e4e4e4")
     axis.set_ylabel("y [m]")
     if len(evaluation.true_landmarks):
         axis.plot(

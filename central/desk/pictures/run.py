@@ -157,7 +157,12 @@ def set_up_map(axis: "Axes") -> None:
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x [m]")
     axis.set_ylabel("y [m]")
-    axis.grid(color="#e4e4e4", linewidth=0.6)
+    set_grid(axis, "#e4e4e4")
+
+
+def set_grid(axis: "Axes", colour: str = "#eeeeee") -> None:
+    """Draw a faint grid below everything else."""
+    axis.grid(color=colour, linewidth=0.6)
     axis.set_axisbelow(True)
 
 
@@ -309,8 +314,7 @@ def _draw_errors(axes: "Sequence[Axes]", robot: RobotResult, colour: str, start_
     scales = (1.0, 1.0, 180.0 / np.pi)
     for k, (axis, scale) in enumerate(zip(axes, scales, strict=True)):
         axis.axhline(0.0, color="#bbbbbb", linewidth=0.7)
-        axis.grid(color="#eeeeee", linewidth=0.6)
-        axis.set_axisbelow(True)
+        set_grid(axis)
         shown, largest = [np.empty(0)], 0.0
         if robot.online is not None:
             drawn = slice(None, None, max(1, len(robot.online.stamps_ns) // DRAWN_ERRORS))
@@ -418,20 +422,27 @@ def consistency_picture(evaluation: Evaluation, history: History, path: FilePath
     figure, axes = new_figure(9.0, 0.6 + 2.9 * len(panels), len(panels), 1)
     for (axis,), draw in zip(axes, panels, strict=True):
         axis.sharex(axes[0][0])
-        draw(axis, evaluation, history)
-        axis.grid(color="#eeeeee", linewidth=0.6)
-        axis.set_axisbelow(True)
+        axis.axhline(1.0, color="#888888", linewidth=0.8)
+        largest, label, title = draw(axis, evaluation, history)
+        axis.set_ylabel(label)
+        axis.set_title(title, fontsize=10)
+        if largest > LOGARITHMIC_FROM:
+            axis.set_yscale("symlog", linthresh=2.0)
+        axis.set_ylim(0.0, (1.5 if largest > LOGARITHMIC_FROM else 1.25) * largest)
+        set_grid(axis)
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
     axes[-1][0].set_xlabel("team time [s]")
     save(figure, path)
     return True
 
 
-def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
+_Panel = tuple[float, str, str]  # largest drawn value, label of the axis, title
+
+
+def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> _Panel:
     low, high = chi2_interval(3, BAND, 1)
     axis.axhspan(low, high, color=BAND_COLOUR, zorder=0, label="95 % of single poses")
-    axis.axhline(1.0, color="#888888", linewidth=0.8)
-    largest = 0.0
+    largest = high
     colours, labels = robot_colours(evaluation.robots), robot_labels(evaluation.robots)
     for name, robot in evaluation.robots.items():
         if robot.online is None or evaluation.arbitrary_frame:
@@ -445,14 +456,12 @@ def _draw_nees(axis: "Axes", evaluation: Evaluation, history: History) -> None:
         seconds, label = history.seconds(of_map.stamps_ns), "map (blocks only,\nat the end joint)"
         axis.plot(seconds, of_map.values, color=MAP_COLOUR, linewidth=1.4, label=label)
         largest = max(largest, float(of_map.values.max()))
-    _scale(axis, max(largest, high))
-    axis.set_ylabel("NEES per dof")
     title = "NEES: squared errors in units of their covariance; 1 is consistent"
-    axis.set_title(title, fontsize=10)
+    return largest, "NEES per dof", title
 
 
-def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
-    largest, lows, highs = 0.0, [], []
+def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> _Panel:
+    largest, lows, highs = 1.5, [], []
     colours, labels = robot_colours(evaluation.robots), robot_labels(history.innovations)
     for name, of in history.innovations.items():
         each = of.squared, of.dof.astype(np.float64)
@@ -472,14 +481,11 @@ def _draw_nis(axis: "Axes", evaluation: Evaluation, history: History) -> None:
             float(np.median(lows)), float(np.median(highs)), color=BAND_COLOUR, zorder=0,
             label="95 % of points",
         )  # fmt: skip
-    axis.axhline(1.0, color="#888888", linewidth=0.8)
-    _scale(axis, max(largest, *highs, 1.5))
-    axis.set_ylabel("NIS per dof")
-    axis.set_title("Measurements against the particles' predictions: needs no truth", fontsize=10)
+    title = "Measurements against the particles' predictions: needs no truth"
+    return max(largest, *highs), "NIS per dof", title
 
 
-def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
-    axis.axhline(1.0, color="#888888", linewidth=0.8)
+def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> _Panel:
     for level, colour, name in (
         (WARN, ORANGE, "covariances too small"),
         (FAIL, RED, "covariances not to be trusted"),
@@ -497,14 +503,5 @@ def _draw_cost(axis: "Axes", evaluation: Evaluation, history: History) -> None:
     cost = history.map_cost
     seconds = history.seconds(cost.stamps_ns)
     axis.plot(seconds, cost.values, color=MAP_COLOUR, linewidth=1.4, label="team")
-    _scale(axis, max(largest, float(cost.values.max())))
-    axis.set_ylabel("joint cost per dof")
-    axis.set_title("How well the submaps agree: the centre's monitor, needs no truth", fontsize=10)
-
-
-def _scale(axis: "Axes", largest: float) -> None:
-    if largest > LOGARITHMIC_FROM:
-        axis.set_yscale("symlog", linthresh=2.0)
-        axis.set_ylim(0.0, 1.5 * largest)
-    else:
-        axis.set_ylim(0.0, 1.25 * largest)
+    title = "How well the submaps agree: the centre's monitor, needs no truth"
+    return max(largest, float(cost.values.max())), "joint cost per dof", title

@@ -11,7 +11,7 @@ import os
 import socket
 import threading
 from collections.abc import Collection, Iterator
-from contextlib import AsyncExitStack, contextmanager, nullcontext, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from importlib.resources import files
@@ -113,11 +113,13 @@ class Feed:
         return bool(samples)
 
     def _faults(self) -> list[str]:
-        damaged = (
-            f"{self.tail.damaged} damaged parts of the log were left out; `teamslam log check` "
-            "names them"
-        )
-        return [*filter(None, [self.error]), *[damaged] * bool(self.tail.damaged)]
+        faults = [] if self.error is None else [self.error]
+        if self.tail.damaged:
+            faults.append(
+                f"{self.tail.damaged} damaged parts of the log were left out; `teamslam log check` "
+                "names them"
+            )
+        return faults
 
 
 def refusal(
@@ -158,8 +160,7 @@ async def _proxy(host: str, port: int, behind: str) -> Server:
 async def _forward(viewer: ServerConnection, behind: str) -> None:
     chosen = PROTOCOLS if viewer.subprotocol is None else (viewer.subprotocol,)
     async with connect(behind, subprotocols=chosen, compression=None, max_size=None) as server:
-        ways = [asyncio.ensure_future(_pump(viewer, server))]
-        ways.append(asyncio.ensure_future(_pump(server, viewer)))
+        ways = [asyncio.ensure_future(_pump(*way)) for way in ((viewer, server), (server, viewer))]
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
         for way in ways:
             way.cancel()
@@ -246,16 +247,17 @@ def session(
     """
     # The library logs every connection otherwise.
     logging.getLogger("websockets").setLevel(logging.WARNING)
-    with nullcontext() if foxglove_port is None else _foxglove_server() as foxglove:
-        feed = Feed(Tail(log), foxglove)
-        with serving(feed, host, port, foxglove_port or 0, growing=growing) as shown:
+    if foxglove_port is None:
+        with serving(Feed(Tail(log)), host, port, growing=growing) as shown:
             yield shown
-
-
-def _foxglove_server() -> "FoxgloveServer":
+        return
     from teamslam.central.desk.view.foxglove_server import FoxgloveServer
 
-    return FoxgloveServer()
+    with (
+        FoxgloveServer() as foxglove,
+        serving(Feed(Tail(log), foxglove), host, port, foxglove_port, growing=growing) as shown,
+    ):
+        yield shown
 
 
 @contextmanager
@@ -292,11 +294,9 @@ def serving(
             raise ServerError(
                 f"--host {host}: {_reason(error)}; give an address of this machine"
             ) from error
-        foxglove, of_page = (
-            ("Foxglove", foxglove_port, "--foxglove-port"),
-            ("the page", port, "--port"),
-        )
-        what, number, option = foxglove if servers else of_page
+        what, number, option = "the page", port, "--port"
+        if servers:
+            what, number, option = "Foxglove", foxglove_port, "--foxglove-port"
         raise ServerError(
             f"can not serve {what} at {host}:{number}: {_reason(error)}; choose another {option}, "
             "0 for any free one"
