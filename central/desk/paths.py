@@ -43,23 +43,19 @@ def smoothed_paths(
     for message in found.of(m.Trajectory, ch.TRAJECTORY):
         begin = int(stamps(message.stamps, "stamps")[0])
         last[message.robot, message.incarnation, begin] = message
-    by_robot: dict[str, list[SmoothedPath]] = {}
+    parts: dict[str, list[SmoothedPath]] = {}
+    ends: dict[str, list[int]] = {}
     for (robot, incarnation, _), message in sorted(last.items()):
         progress(robot)
         windows = _windows(found, robot, incarnation) if message.crosses else {}
-        by_robot.setdefault(robot, []).append(_between_ends(found, message, windows))
+        parts.setdefault(robot, []).append(_between_ends(found, message, windows))
+        ends.setdefault(robot, []).extend(stamps(message.stamps, "stamps").tolist())
     maps = found.of(m.FusedMap, ch.FINAL_MAP)
     causes = maps[-1].diagnosis if maps else ()
     paths = {}
-    for robot, parts in by_robot.items():
-        path = _join_parts(parts)
-        ends = [
-            end
-            for message in last.values()
-            if message.robot == robot
-            for end in stamps(message.stamps, "stamps").tolist()
-        ]
-        kept = is_kept(path.stamps_ns, spans_left_out(causes, robot, ends))
+    for robot in parts:
+        path = _join_parts(parts[robot])
+        kept = is_kept(path.stamps_ns, spans_left_out(causes, robot, ends[robot]))
         paths[robot] = SmoothedPath(
             path.stamps_ns[kept],
             path.poses[kept],

@@ -138,12 +138,7 @@ def launch(
         click.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == opt.ANY_PORT:
         listen = opt.LOOPBACK  # must be reachable by drivers
-    warnings = [
-        *scenario_warnings(resolved),
-        *([missing] if missing else []),
-        *_time_warnings(streams),
-    ]
-    for text in warnings:
+    for text in (*scenario_warnings(resolved), *missing, *_time_warnings(streams)):
         click.echo(f"warning: {text}", err=True)
     if json_file is not None:
         _check_writable(json_file)
@@ -256,15 +251,15 @@ def _keep_showing(url: str, log: Path) -> None:
         stop.wait()
 
 
-def _checked_world(scenario: Scenario) -> "tuple[Scenario, str | None, WorldStreams | None]":
+def _checked_world(scenario: Scenario) -> "tuple[Scenario, list[str], WorldStreams | None]":
     from teamslam.sim.world.config import LiveWorld, SimulatedWorld
 
     if isinstance(scenario.world, SimulatedWorld | LiveWorld):
-        return scenario, None, None
+        return scenario, [], None
     from teamslam.sim.scenarios.source import streams_of, with_present_robots
 
     present, missing = with_present_robots(scenario)
-    return present, missing, streams_of(present)
+    return present, [missing] if missing else [], streams_of(present)
 
 
 def _time_warnings(streams: "WorldStreams | None") -> list[str]:

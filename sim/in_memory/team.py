@@ -178,12 +178,24 @@ class World(Protocol):
         """Handle one message."""
 
 
-@dataclass
 class _Seat:
-    node: World | RobotNode | CentralNode
-    bus: MemoryBus
-    link: Link
-    boundary: Boundary
+    """A node with its bus; name: of its liveliness token."""
+
+    def __init__(
+        self, network: MemoryNetwork, node: World | RobotNode | CentralNode, name: str, link: Link
+    ) -> None:
+        self.node, self.link, self.bus = node, link, MemoryBus(network)
+        self._name, self._boundary = name, Boundary(name)
+        robot = node if isinstance(node, RobotNode) else None
+        for channel in node.listens:
+            self.bus.subscribe(channel, robot.robot if robot else "*")
+        for channel in robot.overhears if robot else ():
+            self.bus.subscribe(channel)
+        self.bus.watch_alive("central" if robot else "*")
+
+    def enter(self) -> None:
+        self.send(self.node.begin())
+        self.bus.declare_alive(self._name)
 
     def send(self, out: list[Outgoing]) -> None:
         for outgoing in out:
@@ -192,11 +204,11 @@ class _Seat:
     def take(self, now_ns: int) -> bool:
         samples = self.link.arrived(self.bus.receive(0.0), now_ns)
         for sample in samples:
-            message = self.boundary.let_in(sample, partial(_open_sample, sample))
+            message = self._boundary.let_in(sample, partial(_open_sample, sample))
             if isinstance(message, list):
                 self.send(message)
             else:
-                self.send(self.boundary.hand(self.node, message, sample))
+                self.send(self._boundary.hand(self.node, message, sample))
         return bool(samples)
 
 
@@ -236,18 +248,22 @@ def run_nodes(
             recorder.subscribe(channel)
     recorder.watch_alive()
     names = [config.id for config in scenario.robots]
-    source = _Seat(world, MemoryBus(network), Link(), Boundary("world"))
-    for channel in world.listens:
-        source.bus.subscribe(channel)
-    source.bus.watch_alive()
-    centre = _centre(network, scenario, conditions, central)
+
+    def new_centre() -> _Seat:
+        node = central(scenario.central, names)
+        return _Seat(network, node, "central", conditions.to_centre(names))
+
+    source = _Seat(network, world, "world", Link())
+    centre = new_centre()
     robots = [
-        _robot(network, robot(config, scenario.exchange), conditions) for config in scenario.robots
-    ]
-    _enter(source, "world")
-    _enter(centre, "central")
-    for name, seat in zip(names, robots, strict=True):
-        _enter(seat, ch.robot_node(name))
+        _Seat(
+            network, robot(config, scenario.exchange), ch.robot_node(config.id),
+            conditions.to_robot(config.id),
+        )
+        for config in scenario.robots
+    ]  # fmt: skip
+    for seat in (source, centre, *robots):
+        seat.enter()
     now_ns = world.now_ns
     up = True
     while True:
@@ -258,8 +274,8 @@ def run_nodes(
             centre.bus.close()
             up = False
         elif not up and not conditions.centre_is_down(now_ns):
-            centre = _centre(network, scenario, conditions, central)
-            _enter(centre, "central")
+            centre = new_centre()
+            centre.enter()
             up = True
         seats = [source, *([centre] if up else []), *robots]
         busy = sum(seat.take(now_ns) for seat in seats)
@@ -271,37 +287,6 @@ def run_nodes(
         if not coming:
             return
         now_ns = min(coming)  # the world has ended or waits: advance to the next arrival
-
-
-def _enter(seat: _Seat, token: str) -> None:
-    seat.send(seat.node.begin())
-    seat.bus.declare_alive(token)
-
-
-def _centre(
-    network: MemoryNetwork,
-    scenario: Scenario,
-    conditions: Conditions,
-    central: Callable[[CentralConfig, list[str]], CentralNode],
-) -> _Seat:
-    names = [config.id for config in scenario.robots]
-    node = central(scenario.central, names)
-    bus = MemoryBus(network)
-    for channel in node.listens:
-        bus.subscribe(channel)
-    bus.watch_alive()
-    return _Seat(node, bus, conditions.to_centre(names), Boundary("central"))
-
-
-def _robot(network: MemoryNetwork, node: RobotNode, conditions: Conditions) -> _Seat:
-    bus = MemoryBus(network)
-    for channel in node.listens:
-        bus.subscribe(channel, node.robot)
-    for channel in node.overhears:
-        bus.subscribe(channel)
-    bus.watch_alive("central")
-    boundary = Boundary(ch.robot_node(node.robot))
-    return _Seat(node, bus, conditions.to_robot(node.robot), boundary)
 
 
 def final_map(samples: list[Sample]) -> m.FusedMap:

@@ -57,10 +57,9 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
     world = watch.world
     statuses = [(node, watch.statuses[node]) for node in in_order(watch.statuses)]
     if world is None:
-        statuses = (
-            [("recorder", watch.statuses["recorder"])] if "recorder" in watch.statuses else []
-        )
-        texts = [f"{node}: {'; '.join(s.warnings)}" for node, s in statuses if s.warnings]
+        recorder = watch.statuses.get("recorder")
+        waits = recorder is not None and recorder.warnings
+        texts = [f"recorder: {'; '.join(waits)}"] if waits else []
     elif world.state == "waiting":
         texts = [f"{world.node}: {w}" for w in world.warnings]
     else:
@@ -74,11 +73,10 @@ def warnings(watch: Watch, silent_s: float = 0.0) -> list[str]:
 
 def _starting(watch: Watch) -> str:
     missing = watch.missing_robots
-    started = f"{len(watch.robots) - len(missing)} of {len(watch.robots)} robots have started"
-    if not missing:
-        return f"{started}; waiting for the first measurements"
     more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
-    return f"{started}; waiting for {', '.join(missing[:NAMED])}{more}"
+    awaited = ", ".join(missing[:NAMED]) + more if missing else "the first measurements"
+    count = len(watch.robots)
+    return f"{count - len(missing)} of {count} robots have started; waiting for {awaited}"
 
 
 def share(watch: Watch) -> str:
@@ -91,17 +89,13 @@ def share(watch: Watch) -> str:
 
 def times(watch: Watch, world: m.Status) -> str:
     """Describe the map's team time, and a world far ahead."""
-    ahead_s = _behind_s(watch, world)
+    now_s = ahead_s = world.figures.get("team_time_s", 0.0)
+    if watch.fused is not None and watch.fused.stamp_ns:
+        ahead_s = 1e-9 * (world.stamp_ns - watch.fused.stamp_ns)
     if is_live(watch) or ahead_s < AHEAD_S:
         return team_time(world)
-    at_s = max(0.0, world.figures.get("team_time_s", 0.0) - ahead_s)
+    at_s = max(0.0, now_s - ahead_s)
     return f"team time {at_s:,.0f} s (the world is {ahead_s:,.0f} s ahead of the map)"
-
-
-def _behind_s(watch: Watch, world: m.Status) -> float:
-    if watch.fused is None or not watch.fused.stamp_ns:
-        return world.figures.get("team_time_s", 0.0)
-    return max(0.0, 1e-9 * (world.stamp_ns - watch.fused.stamp_ns))
 
 
 def _unjoined_robots(watch: Watch) -> list[tuple[str, str]]:
@@ -112,14 +106,8 @@ def consistency(watch: Watch) -> str:
     """Describe the monitor's figures; with truth, the coverage."""
     central, landmarks = watch.statuses.get("central"), watch.errors.landmarks
     figures = {} if central is None else central.figures
-    parts = [
-        f"{words} {figures[name]:.2f}"
-        for name, words in (
-            ("joint_cost_per_dof", "joint cost per dof"),
-            ("covariance_scale", "covariance scale"),
-        )
-        if name in figures
-    ]
+    names = ("joint_cost_per_dof", "covariance_scale")
+    parts = [f"{n.replace('_', ' ')} {figures[n]:.2f}" for n in names if n in figures]
     if landmarks.count:
         parts.append(f"{landmarks.coverage:.0%} of landmarks within 95 %")
     return ", ".join(parts)
@@ -252,13 +240,13 @@ def _view(title: str, watch: Watch, width: int) -> Group:
 
 
 _COLUMNS = (
-    ("steps", "\nsteps", "{:,.0f}"),
-    ("submaps", "sub-\nmaps", "{:,.0f}"),
-    ("landmarks", "land-\nmarks", "{:,.0f}"),
-    ("pose_sigma_m", "pose\nσ [m]", "{:.2f}"),
-    ("nis_per_dof", "NIS\n/dof", "{:.2f}"),
-    ("messages_per_s", "\nmsg/s", "{:,.0f}"),
-    ("bytes_per_s", "\nB/s", "{:,.0f}"),
+    ("steps", "\nsteps", ",.0f"),
+    ("submaps", "sub-\nmaps", ",.0f"),
+    ("landmarks", "land-\nmarks", ",.0f"),
+    ("pose_sigma_m", "pose\nσ [m]", ".2f"),
+    ("nis_per_dof", "NIS\n/dof", ".2f"),
+    ("messages_per_s", "\nmsg/s", ",.0f"),
+    ("bytes_per_s", "\nB/s", ",.0f"),
 )
 _LEFT_OUT_FIRST = ("messages_per_s", "bytes_per_s", "landmarks")
 """Columns left out, in this order, until the table fits the terminal."""
@@ -282,20 +270,16 @@ def _table(
     columns = [each for each in _COLUMNS if each[0] not in left_out]
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     judged = any(errors.of(n.removeprefix("robot/")).count for n in statuses)
-    table.add_column(Text("\nrobot"), no_wrap=True)
-    headings = [heading for _, heading, _ in columns] + ["NEES\n/dof", "in\n95 %"] * judged
-    for heading in headings:
-        table.add_column(Text(heading), justify="right", no_wrap=True)
     peers = any("set_submaps" in status.figures for status in statuses.values())
-    for heading in _PEER_HEADINGS if peers else ():
+    headings = [heading for _, heading, _ in columns]
+    headings += ["NEES\n/dof", "in\n95 %"] * judged + [*_PEER_HEADINGS] * peers
+    table.add_column(Text("\nrobot"), no_wrap=True)
+    for heading in headings:
         table.add_column(Text(heading), justify="right", no_wrap=True)
     table.add_column(Text("\nstate"), no_wrap=True)
     for node, status in list(statuses.items())[:_SHOWN_AT_MOST]:
         robot = node.removeprefix("robot/")
-        cells = [
-            form.format(status.figures[key]) if key in status.figures else "–"
-            for key, _, form in columns
-        ]
+        cells = [_number(status.figures.get(key), form) for key, _, form in columns]
         if judged:
             tally = errors.of(robot)
             cells += [_number(tally.mean, ".2f"), _number(tally.coverage, ".0%")]

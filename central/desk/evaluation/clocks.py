@@ -9,7 +9,7 @@ Zeger 1986).
 import math
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import numpy as np
@@ -243,14 +243,16 @@ class Pairs:
         return _turn(self.b_i - d, -turn)
 
 
-def _pairs_of(timed: Timed, config: RobotConfig) -> Pairs | None:
+def _pairs_of(timed: Timed, config: RobotConfig, side: float = 1.0) -> Pairs | None:
+    """Pairs of measurements, or None for too few; side: −1 reflects the bearings."""
     if not timed.ends_ns or not timed.ids:
         return None
     path = _dead_reckoning(timed, config)
     stamps, names = np.array(timed.stamps_ns, np.int64), np.array(timed.ids, np.int64)
     order = np.lexsort((stamps, names))
     stamps, names = stamps[order], names[order]
-    points = _on_base(np.array(timed.seen).reshape(-1, 2)[order], config.sensor)
+    seen = np.array(timed.seen).reshape(-1, 2)[order] * (1.0, side)
+    points = _on_base(seen, config.sensor)
     apart = np.diff(stamps)
     chosen = (np.diff(names) == 0) & (apart > 0) & (apart <= APART_NS)
     chosen &= stamps[:-1] > int(path.starts_ns[0]) + LARGEST_NS
@@ -372,10 +374,8 @@ def mirrored_cause(robot: str, timed: Timed, config: RobotConfig) -> m.Diagnosis
 def _gains(timed: Timed, config: RobotConfig) -> Float[np.ndarray, " n"]:
     """χ² that a reflection removes from each stretch of time."""
     none = np.zeros(0)
-    seen = np.array(timed.seen).reshape(-1, 2) * (1.0, -1.0)
     with np.errstate(all="ignore"):
-        own = _pairs_of(timed, config)
-        other = _pairs_of(replace(timed, seen=array("d", seen.ravel().tolist())), config)
+        own, other = (_pairs_of(timed, config, side) for side in (1.0, -1.0))
         if own is None or other is None:
             return none
         unit = min(float(np.median(each.gaps)) for each in (own, other))

@@ -21,6 +21,7 @@ from teamslam.central.desk.evaluation.clocks import (
     separate_times_warning,
 )
 from teamslam.central.desk.evaluation.errors import (
+    Covariance,
     MapErrors,
     Path,
     Points,
@@ -46,7 +47,6 @@ from teamslam.central.desk.names import data_set_of, in_order
 from teamslam.central.diagnosis import contradicts
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED, RobotConfig
-from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
@@ -377,7 +377,7 @@ def _own_map(log: Collected, robot: str) -> MapErrors | None:
 
 
 def _errors(
-    means: Points, covariance: Matrix, truth: Points, known: Bool[np.ndarray, " n"]
+    means: Points, covariance: Covariance, truth: Points, known: Bool[np.ndarray, " n"]
 ) -> MapErrors | None:
     rows = np.flatnonzero(np.repeat(known, 2))
     if not known.any():

@@ -25,6 +25,7 @@ from teamslam.central.saved_maps import COUNTED_TWICE
 from teamslam.team.config import MAP
 from teamslam.team.estimation.gaussian import Matrix
 from teamslam.team.estimation.map_joining.saved_maps import REMEDY
+from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 
@@ -190,7 +191,7 @@ class Evaluation:
     faults: int = 0
     scale_by_robot: Mapping[str, float] = field(default_factory=dict)
     arbitrary_frame: bool = False
-    truth_from_map: Float[np.ndarray, "3"] | None = None
+    truth_from_map: Pose | None = None
     peers: Mapping[str, PeerResult] = field(default_factory=dict)
     disagreement: tuple[str, ...] = ()
     association: AssociationResult | None = None

@@ -22,7 +22,7 @@ from teamslam.central.fused_map import START_POSES
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME
 from teamslam.team.estimation.consistency import chi2_quantile, nees
-from teamslam.team.estimation.se2 import inverse
+from teamslam.team.estimation.se2 import Pose, inverse
 from teamslam.team.shapes import Bool, Float, UInt32
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
@@ -137,7 +137,7 @@ class RunningErrors:
 
     spacing_ns: int = SPACING_NS
     last_ns: int | None = None
-    _poses: deque[tuple[int, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]] = field(
+    _poses: deque[tuple[int, Pose, Float[np.ndarray, "3 3"]]] = field(
         default_factory=lambda: deque(maxlen=WAITING)
     )
     _truth: deque[Path] = field(default_factory=lambda: deque(maxlen=BATCHES))
@@ -173,7 +173,7 @@ class RunningErrors:
         path = Path(np.array(times, dtype=np.int64), np.array(poses))
         return pose_errors(path, np.array(covariances), self._path(times[-1]))
 
-    def truth_at(self, stamp_ns: int) -> Float[np.ndarray, "3"] | None:
+    def truth_at(self, stamp_ns: int) -> Pose | None:
         """True pose at a time, or None."""
         poses, known = interpolate_truth(self._path(stamp_ns), np.array([stamp_ns]))
         return poses[0] if known[0] else None
@@ -228,7 +228,7 @@ class TruthAlignment:
             case _:
                 pass
 
-    def map_from_truth(self, fused: m.FusedMap | None) -> Float[np.ndarray, "3"] | None:
+    def map_from_truth(self, fused: m.FusedMap | None) -> Pose | None:
         """Rigid motion (x [m], y [m], theta [rad]); None if undetermined.
 
         Without landmarks the frame is that of the initial poses.

@@ -90,13 +90,13 @@ def _answers_of(log: Log) -> Iterator[Answer]:
 
 
 def _smoothed(log: Log) -> Iterator[Answer]:
+    kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
     for robot, path in smoothed_paths(index_log(log)).items():
         names = ros.Names(f"/{robot}")
         for stamp_ns, (x, y, theta), P in zip(
             path.stamps_ns.tolist(), path.poses.tolist(), path.covariances, strict=True
         ):
             pose = ros.pose_with_covariance(stamp_ns, names.map_frame, (x, y, theta), P)
-            kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
             yield Answer(names.topic("smoothed_pose"), kind, stamp_ns, ros.encode(pose))
 
 

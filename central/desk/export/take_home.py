@@ -119,29 +119,18 @@ def _detections(submap: m.Submap) -> Iterator[tuple[Place, int]]:
 def write_map(fused: MapResult, taken: TakenHome, folder: FilePath) -> list[FilePath]:
     """Write map.csv and map.json with 2 × 2 covariances."""
     datum, states = taken.datum, {each.landmark: each.state for each in fused.changes}
+    upper = translate.blocks_of(fused.covariance)[:, (0, 0, 1), (0, 1, 1)].tolist()
+    places = [] if datum is None else geodetic_from_local(datum, fused.means).tolist()
+    columns = [*MAP_COLUMNS, *[STATE] * bool(states), *CLASSES * bool(taken.classes)]
+    columns += DEGREES * (datum is not None)
     rows: list[dict[str, Any]] = []
-    for landmark, (x, y), ((xx, xy), (_, yy)) in zip(
-        fused.ids.tolist(), fused.means.tolist(), translate.blocks_of(fused.covariance).tolist(),
-        strict=True,
-    ):  # fmt: skip
+    for k, landmark in enumerate(fused.ids.tolist()):
         count = taken.measurements.get(landmark, None if landmark >= UNNAMED else 0)
-        values = (landmark, x, y, xx, xy, yy, count, fused.frame)
-        row = dict(zip(MAP_COLUMNS, values, strict=True))
-        if states:
-            row[STATE] = states.get(landmark)
-        if taken.classes:
-            found = taken.classes.get(landmark, (None, None))
-            row |= zip(CLASSES, found, strict=True)
-        rows.append(row)
-    if datum is not None:
-        for row, place in zip(rows, geodetic_from_local(datum, fused.means).tolist(), strict=True):
-            row |= zip(DEGREES, place, strict=True)
-    columns = (
-        *MAP_COLUMNS,
-        *[STATE] * bool(states),
-        *CLASSES * bool(taken.classes),
-        *DEGREES * (datum is not None),
-    )
+        values = [landmark, *fused.means[k].tolist(), *upper[k], count, fused.frame]
+        values += [states.get(landmark)] * bool(states)
+        values += taken.classes.get(landmark, (None, None)) if taken.classes else ()
+        values += places[k] if places else ()
+        rows.append(dict(zip(columns, values, strict=True)))
     table, data = folder / "map.csv", folder / "map.json"
     with table.open("w", encoding="utf-8", newline="") as lines:
         writer = csv.DictWriter(lines, columns, lineterminator="\n")

@@ -18,6 +18,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from teamslam.central.desk.drawing import ellipses
 from teamslam.central.desk.view.drawn import Landmarks
+from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Float
 from teamslam.team.wire.views import MAP_FRAME
 
@@ -62,7 +63,7 @@ def true_landmarks_entity(stamp_ns: int, truth: Float[np.ndarray, "T 2"], size_m
 def robot_entity(
     stamp_ns: int,
     name: str,
-    pose: Float[np.ndarray, "3"],
+    pose: Pose,
     covariance: Float[np.ndarray, "3 3"],
     trail: Sequence[tuple[float, float]],
     colour: str,
@@ -86,9 +87,7 @@ def robot_entity(
     )
 
 
-def true_robot_entity(
-    stamp_ns: int, name: str, pose: Float[np.ndarray, "3"], size_m: float
-) -> Fields:
+def true_robot_entity(stamp_ns: int, name: str, pose: Pose, size_m: float) -> Fields:
     """True pose of a robot."""
     arrow = _arrow(_pose(*pose.tolist()), 0.8 * size_m, (TRUTH[0], 0.6))
     return _entity(stamp_ns, f"true robot {name}", arrows=[arrow])
@@ -108,7 +107,7 @@ def dots_entity(
     return _entity(stamp_ns, name, cylinders=[_dot(x, y, size_m, shade) for x, y in points])
 
 
-def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]]) -> bytes:
+def transforms(stamp_ns: int, poses: Iterable[tuple[str, Pose]]) -> bytes:
     """map_from_robot of each robot."""
     found = []
     for name, pose in poses:
@@ -119,7 +118,7 @@ def transforms(stamp_ns: int, poses: Iterable[tuple[str, Float[np.ndarray, "3"]]
     return _encode(FrameTransforms, transforms=found)
 
 
-def pose_in_map(stamp_ns: int, pose: Float[np.ndarray, "3"]) -> bytes:
+def pose_in_map(stamp_ns: int, pose: Pose) -> bytes:
     """Pose in the frame of the map."""
     return _encode(PoseInFrame, **_in_map(stamp_ns), pose=_pose(*pose.tolist()))
 

@@ -21,7 +21,7 @@ from teamslam.central.desk.view.drawn import (
     centre_particles,
     landmarks_of,
 )
-from teamslam.team.estimation.se2 import compose
+from teamslam.team.estimation.se2 import Pose, compose
 from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -36,7 +36,7 @@ LAG_NS = 30_000_000_000  # a robot further behind the fastest does not hold back
 MOST_PERIODS = 60  # most views per message
 FORGET_NS = 10_000_000_000  # time for which an estimate waits for its truth
 _MARKS_ACROSS = 45.0  # drawn robots that fit across the known extent
-Motion = Float[np.ndarray, "3"] | None
+Motion = Pose | None
 
 
 class Shown(NamedTuple):
@@ -59,7 +59,7 @@ class _Robot:
     reached_ns: int | None = None
     estimate: m.PoseEstimate | None = None
     errors: RunningErrors = field(default_factory=RunningErrors)
-    last_error: tuple[Float[np.ndarray, "3"], float] | None = None
+    last_error: tuple[Pose, float] | None = None
     track: Track = field(default_factory=Track)
     true_track: Track = field(default_factory=Track)
     smoothed: list[tuple[float, float]] = field(default_factory=list)
@@ -69,7 +69,7 @@ class _Robot:
     done: bool = False
     status: dict[str, float] = field(default_factory=dict)
 
-    def pose(self) -> Float[np.ndarray, "3"]:
+    def pose(self) -> Pose:
         assert self.estimate is not None
         return floats(self.estimate.pose, "pose").astype(np.float64)
 
@@ -146,7 +146,7 @@ class ViewerNode:
             out += self._views(now_ns)
         if channel is ch.FINAL_MAP and not self.finished:
             self.finished = True
-            newest = [r.reached_ns for r in self._robots.values() if r.reached_ns is not None]
+            newest = (r.reached_ns for r in self._robots.values() if r.reached_ns is not None)
             out += self._views(max(newest), last=True)
         return out
 
@@ -310,9 +310,8 @@ class ViewerNode:
             lines = [
                 ("true path", [(x, y) for x, y in true.tolist()], (fox.TRUTH[0], 0.5), 1.0),
                 ("path", robot.track.points, (colour, 0.5), 1.5),
+                ("smoothed path", [] if robot.at_ends else robot.smoothed, (colour, 1.0), 2.5),
             ]
-            if not robot.at_ends:
-                lines.append(("smoothed path", robot.smoothed, (colour, 1.0), 2.5))
             entities += [
                 fox.path_entity(now_ns, f"{what} {name}", points, shade, pixels)
                 for what, points, shade, pixels in lines
