@@ -66,15 +66,11 @@ def smoothed_paths(
 
 
 def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:
-    windows: dict[int, ClosedWindow] = {}
-
-    def keep(closed: ClosedWindow) -> None:
-        windows[closed.end_ns] = closed
-
+    closed: list[ClosedWindow] = []
     with suppress(RerunError):
         if found.robot_config(robot)[0].estimator == "hybrid":
-            run_alone(found, robot, incarnation, on_window=keep)
-    return windows
+            run_alone(found, robot, incarnation, on_window=closed.append)
+    return {window.end_ns: window for window in closed}
 
 
 def _between_ends(

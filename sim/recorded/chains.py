@@ -159,7 +159,9 @@ def _chain(
                 )
             case m.Odometry() | m.Increment() | m.Steering():
                 segmenter.integrate(translate.interval_of(measurement, config), is_measured=True)
-                keyframes += _keyframes(segmenter, grid)
+                if grid is not None:
+                    grid.pass_stops()
+                keyframes += segmenter.take_keyframes()
     rest = segmenter.cut(last_ns)
     keyframes += segmenter.take_keyframes()
     if any(part.any() for part in rest.motion):
@@ -176,12 +178,6 @@ def _chain(
         ),
         sightings=() if grid is None else grid.sightings(),
     )
-
-
-def _keyframes(segmenter: core.Segmenter, grid: PoseGrid | None) -> list[core.Keyframe]:
-    if grid is not None:
-        grid.pass_stops()
-    return list(segmenter.take_keyframes())
 
 
 def _grid(config: RobotConfig, segmenter: core.Segmenter, begin_ns: int) -> PoseGrid | None:

@@ -112,14 +112,11 @@ IN_THE_FRAME = frozenset({
 })  # fmt: skip
 """Unaligned figures, meaningless in an arbitrary frame."""
 _SCORES = {each: each for each in ("precision", "recall", "f1", "wrong_percent")}
-_ASSOCIATION = {
-    "landmarks": "landmarks",
-    "duplicates": "duplicates",
-    "duplicates_confirmed": "duplicates_confirmed",
-    "duplicates_shown": "duplicates_shown",
-    "merges_right": "merges_right",
-    "merges_wrong": "merges_wrong",
-    "merges_refused": "merges_refused",
+_SAME_NAMES = (
+    "landmarks", "duplicates", "duplicates_confirmed", "duplicates_shown", "merges_right",
+    "merges_wrong", "merges_refused",
+)  # fmt: skip
+_ASSOCIATION = {each: each for each in _SAME_NAMES} | {
     "labelled_detections": "pairs.detections",
     "labelled_detections_left_out": "left_out",
     "unlabelled_detections_in_the_map": "clutter_in_map",

@@ -1,6 +1,5 @@
 """Index a log by recorded inputs and recomputable outputs."""
 
-from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +33,6 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
 
     def __init__(self) -> None:
         self._messages: dict[int, m.Measurement] = {}
-        self._odometry: list[int] | None = None
         self.contradicted: list[int] = []
 
     def put(self, message: m.Measurement) -> None:
@@ -42,7 +40,6 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         known = self._messages.setdefault(message.number, message)
         if known is not message and known != message:
             self.contradicted.append(message.number)
-        self._odometry = None
 
     def __getitem__(self, number: int) -> m.Measurement:
         return self._messages[number]
@@ -58,13 +55,6 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         """Least and greatest stamp."""
         stamps = [each.stamp_ns for each in self._messages.values()]
         return min(stamps), max(stamps)
-
-    def intervals(self, begin: int, end: int) -> int:
-        """Number of odometry intervals numbered begin … end − 1."""
-        if self._odometry is None:
-            numbers = (n for n, x in self._messages.items() if isinstance(x, m.AnyOdometry))
-            self._odometry = sorted(numbers)
-        return bisect_left(self._odometry, end) - bisect_left(self._odometry, begin)
 
     def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement]:
         """Yield measurements begin … end − 1, up to the first gap."""

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from itertools import takewhile
+from itertools import accumulate, takewhile
 from typing import Any
 
 from teamslam.central.desk.verification.recorded import (
@@ -143,10 +143,13 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
 
 
 def _first_of(done: m.Done, chain: Sequence[m.Submap], measurements: RecordedMeasurements) -> int:
+    """Number of a process's first measurement: `done.steps` odometry intervals before its last."""
     last = min(done.measurements, max(measurements) + 1)
+    is_step = (isinstance(measurements.get(n), m.AnyOdometry) for n in range(last))
+    steps = [0, *accumulate(is_step)]
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in sorted((each for each in begins if each <= last), reverse=True):
-        if measurements.intervals(counter, done.measurements) == done.steps:
+        if steps[last] - steps[counter] == done.steps:
             return counter
     return 0
 
