@@ -73,10 +73,7 @@ def measure_latency(log: Path) -> dict[str, Any]:
 
 
 def _first(
-    found: dict[Submap, float],
-    arrived: dict[Submap, float],
-    members: Any,
-    at: float,
+    found: dict[Submap, float], arrived: dict[Submap, float], members: Any, at: float
 ) -> None:
     for each in members:
         sequence = each.sequence

@@ -26,10 +26,7 @@ PROGRAMS = {
         ),
     ),
     "bits_algebra": ("1a4d2800e5776554", ("dense", "gaussian", "chi2")),
-    "bits_maps": (
-        "5b4d4dd12f244a66",
-        ("own_map", "chain", "submap_factor", "dense", "gaussian"),
-    ),
+    "bits_maps": ("5b4d4dd12f244a66", ("own_map", "chain", "submap_factor", "dense", "gaussian")),
     "bits_sparse": ("f86e6c8d2c75a282", ("ordering", "sparse_pattern", "sparse", "dense")),
     "bits_odometry": ("fba0d664d0eb528d", ("motion", "segmenter", "measurements")),
 }

@@ -90,12 +90,7 @@ EXAMPLES = {
     **{f"{each}.mean": MEAN.copy for each in ("Chain.append", "corrected", "SubmapFactor")},
     **{
         f"{each}.covariance": lambda: covariance(7)
-        for each in (
-            "WholeMap",
-            "WholeMap.joined",
-            "Chain.append",
-            "corrected",
-        )
+        for each in ("WholeMap", "WholeMap.joined", "Chain.append", "corrected")
     },
     "sensitivity": lambda: np.ones((1, 7)),
     "curvature": lambda: np.ones((1, 7)),
@@ -168,10 +163,7 @@ EXAMPLES = {
     "normals": lambda: np.ones((4, 3)),
     **{
         f"{each}.shift": lambda: np.array([1.0, 0.0, 0.0, 0.5])
-        for each in (
-            "Window.advance",
-            "Window.move",
-        )
+        for each in ("Window.advance", "Window.move")
     },
     "means": MEANS.copy,
     "covariances": COVARIANCES.copy,

@@ -266,13 +266,7 @@ def test_a_full_disk_ends_no_run_and_the_log_goes_on_when_there_is_room(
     limit(-1)
     assert logged(path, c.OWN_POSE) < said, "what was written reads"
     room = True
-    world.publish(
-        Outgoing(
-            c.END,
-            "",
-            build.end(incarnation=0, alpha=said),
-        )
-    )
+    world.publish(Outgoing(c.END, "", build.end(incarnation=0, alpha=said)))
     for now_s in (1e9, 2e9, 3e9):
         loop.request_missing(now_s)
         loop.take(bus.receive())

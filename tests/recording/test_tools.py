@@ -94,10 +94,7 @@ NO_END = "world/end: missing: the number of measurements is unknown"
 TWO_LOST = [s for s in TWO if s.counter not in (3, 4, 8) or "odometry" not in s.key]
 FOUND: dict[str, tuple[list[Sample], list[str]]] = {
     "nothing": (TWO, []),
-    "lost messages": (
-        TWO_LOST,
-        ["source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8"],
-    ),
+    "lost messages": (TWO_LOST, ["source/alpha: 3 measurements of incarnation 1 missing: 3–4, 8"]),
     "a recorder that came late": (TWO[6:], [FIRST_LOST]),
     "a publisher that starts again": (ONE + later(ONE), []),
     "a publisher that starts again, first messages lost": (

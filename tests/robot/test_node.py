@@ -72,10 +72,7 @@ noise = st.one_of(
     st.builds(fused, st.sampled_from([(), (1, 2), (77,)]), st.floats(-1e9, 1e9)),
     st.just(CENTRE),
     st.just(build.liveliness(node="central", alive=False)),
-    st.builds(
-        lambda n: build.progress(node="central", submaps=n),
-        st.integers(0, 100),
-    ),
+    st.builds(lambda n: build.progress(node="central", submaps=n), st.integers(0, 100)),
 )
 
 
@@ -146,7 +143,7 @@ def test_every_measurement_has_one_disposition(name, keyframe_s, estimator):
     node = node_for(config(front_end=front_end, estimator=estimator, fusion=fusion))
     node.handle(build.liveliness(node="central", alive=False))
     node.handle(
-        m.KnownMap(stamp_ns=0, ids=from_ids([1, 2]), positions=from_floats([5.0, 3.0, 9.0, -2.0])),
+        m.KnownMap(stamp_ns=0, ids=from_ids([1, 2]), positions=from_floats([5.0, 3.0, 9.0, -2.0]))
     )
     out = driven(node, measurements)
     (done,) = of(out, ch.ROBOT_DONE)
@@ -217,13 +214,9 @@ def test_a_robot_is_so_many_submaps_ahead_of_a_living_centre_and_no_more(monkeyp
     node.handle(CENTRE)
     out = [o for r in MEASUREMENTS for o in node.handle(r)] + node.handle(END)
     assert len(of(out, ch.SUBMAP)) == 2
-    out += node.handle(
-        build.progress(node="central", incarnation=7, submaps=9),
-    )
+    out += node.handle(build.progress(node="central", incarnation=7, submaps=9))
     assert len(of(out, ch.SUBMAP)) == 2, "credit of another incarnation is none"
-    out += node.handle(
-        build.progress(node="central", submaps=1),
-    )
+    out += node.handle(build.progress(node="central", submaps=1))
     assert len(of(out, ch.SUBMAP)) == 3
     out += node.handle(build.liveliness(node="robot/r2", alive=False))
     assert len(of(out, ch.SUBMAP)) == 3, "another node's token is not the centre's"

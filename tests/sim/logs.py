@@ -88,11 +88,7 @@ def online(channel: ch.Channel, poses: np.ndarray, of: Scenario) -> list[Outgoin
     ends = streams(of).streams[0].intervals.end_ns.tolist()
     unit = from_floats(np.eye(3))
     return [
-        Outgoing(
-            channel,
-            "r1",
-            build.pose_estimate(stamp_ns=t, pose=p, covariance=unit),
-        )
+        Outgoing(channel, "r1", build.pose_estimate(stamp_ns=t, pose=p, covariance=unit))
         for t, p in zip(ends, poses, strict=True)
     ]
 

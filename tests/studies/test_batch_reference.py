@@ -8,12 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from teamslam.sim.recorded.chains import (
-    BatchReferenceError,
-    Chain,
-    Scan,
-    chains_of,
-)
+from teamslam.sim.recorded.chains import BatchReferenceError, Chain, Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
 from teamslam.sim.studies.batch_reference.reference import BatchReference, batch_map

@@ -1,12 +1,7 @@
 import pytest
 
 from teamslam.sim.studies.experiments import accuracy_worlds
-from teamslam.sim.studies.experiments.experiment import (
-    Goal,
-    Options,
-    Results,
-    runs_of,
-)
+from teamslam.sim.studies.experiments.experiment import Goal, Options, Results, runs_of
 from teamslam.sim.studies.experiments.team_runs import Figures, over_seeds
 from tests import commands
 

@@ -424,8 +424,7 @@ def test_noise_is_no_attachment(data):
 
 
 @pytest.mark.parametrize(
-    "other",
-    ["team/t/robot/r1/team/pose", "team/t/robot/r2/submap", "team/u/robot/r1/submap"],
+    "other", ["team/t/robot/r1/team/pose", "team/t/robot/r2/submap", "team/u/robot/r1/submap"]
 )
 def test_an_attachment_of_another_key_is_refused(other):
     with pytest.raises(AttachmentError, match="another key"):

@@ -23,15 +23,7 @@ from teamslam.team.wire.zenoh.recovery import Recovery
 from teamslam.team.wire.zenoh.router import router
 from teamslam.team.wire.zenoh.session import client
 from tests import build
-from tests.support import (
-    ROOT,
-    Link,
-    example,
-    odometry,
-    received,
-    submap,
-    wait_until,
-)
+from tests.support import ROOT, Link, example, odometry, received, submap, wait_until
 
 FINAL = example(m.FusedMap)
 

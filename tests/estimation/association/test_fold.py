@@ -5,11 +5,7 @@ import pytest
 
 from teamslam.central.join_messages import Shown, reasons
 from teamslam.team.association import AssociationProfile
-from teamslam.team.estimation.association.landmark_sets import (
-    OPEN,
-    Opened,
-    Verdict,
-)
+from teamslam.team.estimation.association.landmark_sets import OPEN, Opened, Verdict
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.auditing import fold_tick, share_now
 from teamslam.team.estimation.map_joining.joining import (
@@ -19,12 +15,7 @@ from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
     Tick,
 )
-from tests.estimation.association.unnamed_worlds import (
-    circle,
-    drive,
-    duplicates,
-    wrong,
-)
+from tests.estimation.association.unnamed_worlds import circle, drive, duplicates, wrong
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
 LOOP = circle((0.0, 0.0), 20.0, 24, 1.25)

@@ -197,9 +197,7 @@ def factor_of_motion(covariance):
 
 @quick
 @given(
-    st.lists(st.floats(-3.0, 3.0), min_size=9, max_size=9),
-    st.integers(0, 3),
-    st.floats(1e-6, 1e3),
+    st.lists(st.floats(-3.0, 3.0), min_size=9, max_size=9), st.integers(0, 3), st.floats(1e-6, 1e3)
 )
 @example([3.6e-165, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0], 1, 610.0)
 def test_a_covariance_of_any_rank_is_the_product_of_its_factor(entries, rank, scale):

@@ -39,11 +39,7 @@ def total(keyframes, rest):
 
 
 @settings(deadline=None, max_examples=60)
-@given(
-    st.lists(st.integers(0, SECOND), max_size=6),
-    st.floats(-2.0, 2.0),
-    st.floats(-1.5, 1.5),
-)
+@given(st.lists(st.integers(0, SECOND), max_size=6), st.floats(-2.0, 2.0), st.floats(-1.5, 1.5))
 def test_observations_within_an_interval_split_its_mean_exactly(cuts, forward, yaw_rate):
     split, whole = (segmenter_of(WHITE, Sensor(), 0.0) for _ in range(2))
     for segmenter in (split, whole):
@@ -111,11 +107,7 @@ def test_a_scan_is_calibrated_and_what_the_sensor_can_not_see_is_left_out():
     segmenter.observe(SECOND, scan((1, 0.9, 0.0), (2, 4.5, 0.25)))
     (keyframe,) = driven(segmenter, SECOND, SECOND, 1.0, 0.0)
     seen = keyframe.scan
-    assert (seen.ids.tolist(), seen.ranges.tolist(), seen.bearings.tolist()) == (
-        [2],
-        [2.0],
-        [0.25],
-    )
+    assert (seen.ids.tolist(), seen.ranges.tolist(), seen.bearings.tolist()) == ([2], [2.0], [0.25])
 
 
 def keyframe(scans, forward=0.0, yaw_rate=0.0):

@@ -118,10 +118,7 @@ def test_one_measurement_predicts_another_with_all_of_their_noise(kind):
         return log_density(np.array([of[0] - expected[0], wrapped(of[1] - expected[1])]), S)
 
     moved = lambda xi: compose(pose, exponential(xi))  # noqa: E731
-    logs = (
-        log_likelihood(z, seen, moved),
-        log_likelihood(seen, z, lambda xi: inverse(moved(xi))),
-    )
+    logs = (log_likelihood(z, seen, moved), log_likelihood(seen, z, lambda xi: inverse(moved(xi))))
     expected = 0.5 * (EVIDENCE - math.log(REACH * FIELD) - max(logs))
     assert expected < EVIDENCE
     assert least_prior(pose, spread, np.array([seen, z]), own) == pytest.approx(expected, rel=1e-6)

@@ -30,10 +30,7 @@ SIGMA = {
     "range_scale": 0.01,
 }
 MOTION = MotionModel(
-    "turn-then-drive",
-    MotionNoise(per_s=0.02),
-    MotionNoise(per_s=0.01),
-    calibrated_speed=(0.0, 0.1),
+    "turn-then-drive", MotionNoise(per_s=0.02), MotionNoise(per_s=0.01), calibrated_speed=(0.0, 0.1)
 )
 
 

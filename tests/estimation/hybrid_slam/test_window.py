@@ -20,9 +20,7 @@ from tests.estimation.submap_world import wrap
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
 ROBOT = MotionModel(
-    kind="turn-then-drive",
-    forward=MotionNoise(per_s=STEP_M),
-    turn=MotionNoise(per_s=STEP_RAD),
+    kind="turn-then-drive", forward=MotionNoise(per_s=STEP_M), turn=MotionNoise(per_s=STEP_RAD)
 )
 ACCURATE = Sensor(range_sigma=0.2, bearing_sigma=np.deg2rad(2.0))
 COARSE = Sensor(range_sigma=2.0, bearing_sigma=np.deg2rad(10.0))

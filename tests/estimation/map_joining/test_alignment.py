@@ -6,9 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.team.estimation.contribution import InitialPoseFactor, moment
-from teamslam.team.estimation.map_joining.alignment import (
-    procrustes,
-)
+from teamslam.team.estimation.map_joining.alignment import procrustes
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import landmark_map, trajectory

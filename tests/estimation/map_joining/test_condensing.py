@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from teamslam.team import core
-from teamslam.team.estimation.map_joining import (
-    marginals,
-)
+from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.condensed_factor import (
     HISTORY,
     SubmapCosts,

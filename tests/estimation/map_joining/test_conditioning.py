@@ -13,10 +13,7 @@ from teamslam.team.estimation.map_joining.conditioning import (
     join_pending,
     remove_landmarks,
 )
-from teamslam.team.estimation.map_joining.gauss_newton import (
-    JoinSettings,
-    joint_marginal,
-)
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
 from teamslam.team.estimation.map_joining.marginals import prior_for, trajectory
 from teamslam.team.estimation.se2 import compose, exponential, tangent
 from teamslam.team.estimation.submap import LocalMap

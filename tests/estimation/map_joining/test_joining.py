@@ -12,9 +12,7 @@ from teamslam.team import core
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.gaussian import NotDeterminedError
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.joining import (
-    solve_fold,
-)
+from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_map,

@@ -14,11 +14,7 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     iterate_tick,
 )
 from teamslam.team.estimation.map_joining.joining import solve_fold
-from teamslam.team.estimation.map_joining.marginals import (
-    landmark_blocks,
-    landmark_map,
-    prior_for,
-)
+from teamslam.team.estimation.map_joining.marginals import landmark_blocks, landmark_map, prior_for
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with

@@ -4,10 +4,7 @@ import pytest
 from teamslam.central.desk.evaluation.errors import Path, pose_errors
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.map_joining import nonlinearity
-from teamslam.team.estimation.map_joining.gauss_newton import (
-    JoinSettings,
-    joint_marginal,
-)
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     add_start,

@@ -8,10 +8,7 @@ import pytest
 from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.joining import (
-    JoinSettings,
-    solve_fold,
-)
+from teamslam.team.estimation.map_joining.joining import JoinSettings, solve_fold
 from teamslam.team.estimation.se2 import compose, inverse, transformed
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with

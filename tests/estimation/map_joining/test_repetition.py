@@ -7,9 +7,7 @@ import pytest
 from teamslam.central.config import CentralConfig
 from teamslam.central.join_messages import reasons, shown_landmarks
 from teamslam.team.association import AssociationProfile
-from teamslam.team.estimation.contribution import (
-    Contribution,
-)
+from teamslam.team.estimation.contribution import Contribution
 from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.distinctness import (
     BY_CHANCE,

@@ -9,12 +9,7 @@ import pytest
 from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.sim.calibration.calibrate import Calibration, calibrate_models
 from teamslam.sim.calibration.data import Reference
-from teamslam.sim.calibration.figures import (
-    CalibrationError,
-    Figure,
-    jackknife,
-    with_figures,
-)
+from teamslam.sim.calibration.figures import CalibrationError, Figure, jackknife, with_figures
 from teamslam.sim.calibration.join import join_team
 from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
 from teamslam.sim.calibration.motion import fit_motion
@@ -24,10 +19,7 @@ from teamslam.sim.calibration.sensor import fit_sensor
 from teamslam.sim.datasets.utias import write_utias
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.sim.world.streams import (
-    Intervals,
-    grouped,
-)
+from teamslam.sim.world.streams import Intervals, grouped
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.commands import output_of, run
 from tests.sim.logs import scenario, streams

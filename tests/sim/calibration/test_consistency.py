@@ -14,11 +14,7 @@ from teamslam.sim.calibration.consistency import (
 )
 from teamslam.sim.calibration.figures import Figure
 from teamslam.sim.scenarios.scenario import load
-from teamslam.team.estimation.map_joining.joining import (
-    Fold,
-    JoinSettings,
-    solve_fold,
-)
+from teamslam.team.estimation.map_joining.joining import Fold, JoinSettings, solve_fold
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import team
 

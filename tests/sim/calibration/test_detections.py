@@ -64,8 +64,7 @@ def test_no_label_is_looked_at():
         replace(
             each,
             landmark_detections=replace(
-                each.landmark_detections,
-                ids=np.full_like(each.landmark_detections.ids, NO_LABEL),
+                each.landmark_detections, ids=np.full_like(each.landmark_detections.ids, NO_LABEL)
             ),
         )
         for each in streams.streams

@@ -359,10 +359,7 @@ def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path):
 def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path):
     scenario = with_options(load("waypoints"), robots=1)
     world = scenario.world
-    scenario = msgspec.structs.replace(
-        scenario,
-        world=msgspec.structs.replace(world, steps=25),
-    )
+    scenario = msgspec.structs.replace(scenario, world=msgspec.structs.replace(world, steps=25))
     streams = streams_of(scenario)
     write_folder(streams, tmp_path)
     again = msgspec.structs.replace(scenario, world=FolderWorld(path=str(tmp_path)))

@@ -148,11 +148,7 @@ def test_pieces_have_each_measurement_once_begin_together_and_know_no_initial_po
             "no odometry int",
         ),
         ("detections", "t_s,range_m,bearing_rad\n0,1,1\n", "it needs step,x_m,y_m,c_xx,c_xy,c_yy"),
-        (
-            "detections",
-            "step,x_m,y_m\n0,1,1\n",
-            "line 1: no column c_xx, c_xy, c_yy",
-        ),
+        ("detections", "step,x_m,y_m\n0,1,1\n", "line 1: no column c_xx, c_xy, c_yy"),
         ("detections", "step,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,0,1\n0,1,1,1,0,1\n", "order of time"),
     ],
 )

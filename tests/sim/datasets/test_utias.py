@@ -137,9 +137,7 @@ def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(fol
     (late,) = read(folder, 1, odometry_delay_s=0.5).streams
     assert np.array_equal(stream.stamps_ns, late.stamps_ns)
     node = WorldNode(
-        utias(world, robots),
-        frozenset(),
-        build.configuration(node="world", incarnation=0),
+        utias(world, robots), frozenset(), build.configuration(node="world", incarnation=0)
     )
     sent = [o.message for o in node.publish(0.0) if isinstance(o.message, m.Odometry)]
     assert sent[0].stamp_ns == late.intervals.end_ns[0] - 400_000_000

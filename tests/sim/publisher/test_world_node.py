@@ -271,9 +271,7 @@ def test_a_world_that_is_started_again_waits_for_everyone_s_word_but_not_for_eve
 
 def test_a_world_whose_stream_had_begun_anew_begins_it_once_more_where_the_robot_is():
     node = world()
-    node.handle(
-        build.progress(stamp_ns=5_000_000_000, incarnation=3, measurements=4),
-    )
+    node.handle(build.progress(stamp_ns=5_000_000_000, incarnation=3, measurements=4))
     out = [r for r in measurements(node.publish(0.0) + node.publish(9.0)) if r.robot == "r1"]
     assert {r.incarnation for r in out} == {4}
     assert [r.number for r in out] == list(range(len(out)))

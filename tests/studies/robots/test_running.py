@@ -2,12 +2,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.sim.studies.estimators import (
-    dead_reckoning,
-    ekf_slam,
-    localisation,
-    plain_fastslam,
-)
+from teamslam.sim.studies.estimators import dead_reckoning, ekf_slam, localisation, plain_fastslam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.sim.studies.robots.filters import (
     NOTHING_KNOWN,

@@ -2,10 +2,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teamslam.sim.studies.rules.map_fusion import (
-    covariance_intersection,
-    kalman,
-)
+from teamslam.sim.studies.rules.map_fusion import covariance_intersection, kalman
 from teamslam.team.estimation.gaussian import LandmarkGaussian
 from tests.estimation.submap_world import correlated
 
