@@ -4,6 +4,7 @@
 the `better` direction ("less" or "more") and `tolerance`, the share by which it may be worse.
 """
 
+import argparse
 import json
 import sys
 from collections.abc import Mapping
@@ -51,8 +52,15 @@ def find_worse(figures: Mapping[str, float], name: str) -> list[str]:
     ]
 
 
-def conclude(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: str) -> int:
-    """Print the figures, write them to `file`, and compare them with the baseline.
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    """Make a parser with the first line of a docstring as its description, and --json."""
+    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    parser.add_argument("--json", type=Path)
+    return parser
+
+
+def conclude(figures: Mapping[str, Any], name: str | None, file: Path | None, *wrong: str) -> int:
+    """Print the figures, write them to `file`, compare them with the baseline of this name, if any.
 
     wrong: further faults. Returns the exit status, 1 for any fault.
     """
@@ -60,6 +68,7 @@ def conclude(figures: Mapping[str, Any], name: str, file: Path | None, *wrong: s
     print(text)
     if file is not None:
         file.write_text(text + "\n")
-    problems = [*wrong, *find_worse(figures, name)]
+    judged = figures.get("figures", figures)
+    problems = [*wrong, *(find_worse(judged, name) if name else [])]
     print("\n".join(problems) or "nothing worse", file=sys.stderr)
     return 1 if problems else 0

@@ -6,8 +6,6 @@ first prior of another robot. Limit: three times the round trip (median from a s
 centre's credit) plus the reported solution time.
 """
 
-import argparse
-import json
 import subprocess
 import sys
 import tempfile
@@ -16,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import find_worse
+from benchmarks.baseline import conclude, parser_of
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -96,23 +94,14 @@ def launch_run(folder: Path) -> Path:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("logs", nargs="*", type=Path)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    problems: list[str] = []
-    if options.logs:
-        found: dict[str, Any] = {str(log): measure_latency(log) for log in options.logs}
-    else:
-        with tempfile.TemporaryDirectory() as made:
-            figures = measure_latency(launch_run(Path(made) / "run"))
-        found = {"ratio": figures["ratio"], "within": figures["within"]}
-        problems = find_worse(found, "fresh")
-    sys.stdout.write(json.dumps(found, indent=1) + "\n")
-    if options.json is not None:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
-    sys.stderr.write("".join(f"worse: {each}\n" for each in problems))
-    return 1 if problems else 0
+    told = parser.parse_args()
+    if told.logs:
+        return conclude({str(log): measure_latency(log) for log in told.logs}, None, told.json)
+    with tempfile.TemporaryDirectory() as made:
+        figures = measure_latency(launch_run(Path(made) / "run"))
+    return conclude({name: figures[name] for name in ("ratio", "within")}, "fresh", told.json)
 
 
 if __name__ == "__main__":

@@ -10,18 +10,15 @@ Without identities the error is to the nearest true landmark, and `window_ms` is
 associate one window of WINDOW scans. Exit status 1 if a figure is worse than growth.json allows.
 """
 
-import argparse
-import json
 import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import find_worse
+from benchmarks.baseline import conclude, parser_of
 from teamslam.central.config import CentralConfig
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.submap_fold import SubmapFold
@@ -32,9 +29,10 @@ from teamslam.team.estimation.association.clustering import associate_window
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import floats, from_floats, ids
+from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
+from tests import build
 
 TICK_S = 10.0
 WINDOW = 25  # ticks per median
@@ -65,14 +63,7 @@ class World:
 
     def starts(self) -> Iterator[m.InitialPose]:
         for r, pose in enumerate(self._poses):
-            yield m.InitialPose(
-                stamp_ns=0,
-                robot=f"r{r}",
-                incarnation=1,
-                number=0,
-                pose=from_floats(pose),
-                covariance=b"",
-            )
+            yield build.initial_pose(robot=f"r{r}", pose=pose)
 
     def tick(self) -> list[m.Submap]:
         made = [self._submap(r) for r in range(len(self._poses))]
@@ -218,23 +209,16 @@ def figures(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--robots", type=int, default=5)
     parser.add_argument("--landmarks", type=int, default=50)
     parser.add_argument("--at", default="250,500,1000,2500")
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--identities", choices=["hidden"])
     told = parser.parse_args()
     at = sorted(int(each) for each in told.at.split(","))
     rows = measure_growth(told.robots, told.landmarks, at, told.identities == "hidden")
-    found: dict[str, Any] = {"rows": rows, "figures": figures(rows)}
-    print(json.dumps(found["figures"], indent=1))
-    if told.json:
-        told.json.write_text(json.dumps(found, indent=1) + "\n")
     case = told.robots, told.landmarks, at[-1], told.identities
-    problems = find_worse(found["figures"], BASELINES[case]) if case in BASELINES else []
-    print("\n".join(problems), file=sys.stderr)
-    return 1 if problems else 0
+    return conclude({"rows": rows, "figures": figures(rows)}, BASELINES.get(case), told.json)
 
 
 if __name__ == "__main__":

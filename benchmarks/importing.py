@@ -7,8 +7,6 @@ refused or sound. Exit status 1 for another error or a figure worse than benchma
 allows.
 """
 
-import argparse
-import json
 import random
 import sys
 import tempfile
@@ -17,7 +15,7 @@ from pathlib import Path
 
 from rosbags.highlevel import AnyReader
 
-from benchmarks.baseline import find_worse
+from benchmarks.baseline import conclude, parser_of
 from teamslam.sim.importing.bag import import_bag
 from teamslam.team.ros2.decoding import READERS, DamagedError, decode, types
 from tests.ros2 import messages as ros
@@ -79,10 +77,9 @@ def damaged(count: int) -> tuple[int, int, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--messages", type=int, default=40_000)
     parser.add_argument("--damaged", type=int, default=1_000_000)
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as place:
@@ -97,12 +94,7 @@ def main() -> int:
     refused, wrong, seconds = damaged(asked.damaged)
     figures |= {"damaged": asked.damaged, "refused": refused, "raised": wrong}
     figures["damaged_per_s"] = round(asked.damaged / seconds)
-    print(json.dumps(figures, indent=1))
-    if asked.json:
-        asked.json.write_text(json.dumps(figures, indent=1) + "\n")
-    problems = find_worse(figures, "importing")
-    print("\n".join(problems))
-    return int(bool(problems))
+    return conclude(figures, "importing", asked.json)
 
 
 if __name__ == "__main__":

@@ -7,8 +7,6 @@ world's simulation. verify_ms: to compute all of it again. equal: share of equal
 largest size over smallest. Exit status 1 if one is worse than in_memory.json allows.
 """
 
-import argparse
-import json
 import multiprocessing
 import resource
 import sys
@@ -16,11 +14,10 @@ import tempfile
 import time
 from math import sqrt
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from benchmarks.baseline import find_worse
+from benchmarks.baseline import conclude, parser_of
 from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -91,10 +88,9 @@ def figures(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--robots", default=MEASURED)
     parser.add_argument("--steps", type=int, default=24)
-    parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     rows = []
     for robots in map(int, told.robots.split(",")):
@@ -102,13 +98,10 @@ def main() -> int:
             row = pool.apply(run, (robots, told.steps))
         rows.append(row)
         print("  ".join(f"{name} {value:.5g}" for name, value in row.items()), flush=True)
-    found: dict[str, Any] = {"rows": rows, "figures": figures(rows)}
-    print(json.dumps(found["figures"], indent=1))
-    if told.json is not None:
-        told.json.write_text(json.dumps(found, indent=1) + "\n")
-    problems = find_worse(found["figures"], "in_memory") if told.robots == MEASURED else []
-    print("\n".join(problems), file=sys.stderr)
-    return int(bool(problems) or found["figures"]["equal"] < 1.0)
+    found = {"rows": rows, "figures": figures(rows)}
+    wrong = [] if found["figures"]["equal"] == 1.0 else ["not all messages are equal"]
+    name = "in_memory" if told.robots == MEASURED else None
+    return conclude(found, name, told.json, *wrong)
 
 
 if __name__ == "__main__":

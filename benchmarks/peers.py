@@ -19,9 +19,9 @@ from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
+from tests import build
 from tests.air import Air, Reach, always
 
 BASELINE = Path(__file__).with_suffix(".json")
@@ -39,19 +39,11 @@ TOLERANCE = 0.05
 def submap(robot: str, sequence: int) -> m.Submap:
     n = 3 + 2 * LANDMARKS
     end_ns = (sequence + 1) * WINDOW_S * SECOND_NS
-    return m.Submap(
-        stamp_ns=end_ns,
-        robot=robot,
-        incarnation=1,
-        sequence=sequence,
-        first_measurement=20 * sequence,
-        last_measurement=20 * sequence + 19,
-        start_ns=end_ns - WINDOW_S * SECOND_NS,
-        config=bytes(8),
-        ids=from_ids(range(LANDMARKS)),
-        mean=from_floats(np.zeros(n)),
-        covariance=from_floats(np.eye(n)[np.triu_indices(n)]),
-    )
+    return build.submap(
+        stamp_ns=end_ns, start_ns=end_ns - WINDOW_S * SECOND_NS, robot=robot, sequence=sequence,
+        first_measurement=20 * sequence, last_measurement=20 * sequence + 19,
+        ids=range(LANDMARKS), mean=np.zeros(n), covariance=np.eye(n)[np.triu_indices(n)],
+    )  # fmt: skip
 
 
 def reach_of(topology: str, robots: int) -> Reach:
@@ -98,9 +90,7 @@ class Team:
 
     def begin(self) -> None:
         for name in self.names:
-            pose = m.InitialPose(
-                stamp_ns=0, robot=name, incarnation=1, number=0, pose=b"", covariance=b""
-            )
+            pose = build.initial_pose(robot=name)
             member = Member(ch.START.key(about(pose)), encoded(pose), pose)
             self.nodes[name].take(member, name)
 

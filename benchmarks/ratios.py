@@ -11,22 +11,20 @@ machine-dependent, without a baseline. Halves of a ratio alternate, each is the 
 Exit status 1 if one is worse than benchmarks/ratios.json allows.
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.baseline import conclude
+from benchmarks.baseline import conclude, parser_of
 from teamslam.sim.studies.estimators.robot_step import RobotStep, innovation
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal, filter_step
 from teamslam.team.estimation.models import Increment, increment_of, segmenter_of
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded, encoded
+from tests import build
 
 MOTION = MotionModel(forward=MotionNoise(per_m=0.03), turn=MotionNoise(per_rad=0.1))
 SENSOR = Sensor(range_sigma=0.2, bearing_sigma=0.03)
@@ -99,34 +97,20 @@ def driving(
 ) -> Callable[[], None]:
     """Make a node's step over odometry intervals, with a scan before the first one of every few."""
     config = RobotConfig("r1", MOTION, SENSOR, front_end)
-    start = m.InitialPose(stamp_ns=0, robot="r1", incarnation=0, number=0, pose=b"", covariance=b"")
+    start = build.initial_pose(incarnation=0)
     ids = np.arange(1, len(ranges) + 1, dtype=np.uint32)
     inputs: list[bytes] = []
     number = 0
     for k in range(intervals):
         if k % every == 0:
             number += 1
-            seen = m.Observations(
-                stamp_ns=k * interval_ns,
-                robot="r1",
-                incarnation=0,
-                number=number,
-                ids=ids.tobytes(),
-                ranges=np.array(ranges).tobytes(),
-                bearings=(0.4 - 0.3 * ids).tobytes(),
-            )
-            inputs.append(encoded(seen))
+            at = {"stamp_ns": k * interval_ns, "incarnation": 0, "number": number}
+            seen = {"ids": ids, "ranges": ranges, "bearings": 0.4 - 0.3 * ids}
+            inputs.append(encoded(build.observations(**at, **seen)))
         number += 1
-        interval = m.Odometry(
-            stamp_ns=(k + 1) * interval_ns,
-            robot="r1",
-            incarnation=0,
-            number=number,
-            duration_ns=interval_ns,
-            forward=0.01,
-            yaw_rate=0.02,
-        )
-        inputs.append(encoded(interval))
+        at = {"stamp_ns": (k + 1) * interval_ns, "incarnation": 0, "number": number}
+        told = {"duration_ns": interval_ns, "forward": 0.01, "yaw_rate": 0.02}
+        inputs.append(encoded(build.odometry(**at, **told)))
 
     def taken() -> None:
         node = RobotNode(config)
@@ -153,12 +137,10 @@ def measure_ratios(rounds: int) -> dict[str, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--json", type=Path)
     told = parser.parse_args()
-    figures = measure_ratios(told.rounds)
-    return conclude(figures, "ratios", told.json)
+    return conclude(measure_ratios(told.rounds), "ratios", told.json)
 
 
 if __name__ == "__main__":

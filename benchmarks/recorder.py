@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import conclude
+from benchmarks.baseline import conclude, parser_of
 from teamslam.sim.scenarios.scenario import dumps, load, with_options
 from teamslam.team.recording.check import check_log
 from teamslam.team.recording.reader import open_log
@@ -28,6 +28,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.zenoh.bus import ZenohBus
+from tests import build
 
 PUBLISHERS = 2
 LANDMARKS = 5  # landmarks per observation
@@ -128,7 +129,8 @@ def measure_recorder(robots: int, hz: float, seconds: float, folder: Path) -> di
                 elapsed = time.monotonic() - began
                 time.sleep(0.2)
             said = [json.loads(each.communicate()[0].splitlines()[-1]) for each in publishers]
-            bus.publish(Outgoing(ch.FINAL_MAP, "", _no_map()))
+            # The message after which a recorder without a team ends.
+            bus.publish(Outgoing(ch.FINAL_MAP, "", build.fused_map(final=True, ids=[], means=[])))
         recorder.wait(timeout=60)
     finally:
         for child in children:
@@ -174,34 +176,11 @@ def _wait_for_recorder(bus: ZenohBus) -> None:
     raise TimeoutError("the recorder did not come up within 60 s")
 
 
-def _no_map() -> m.FusedMap:
-    """Make the message after which a recorder without a team ends."""
-    empty = from_floats([])
-    return m.FusedMap(
-        stamp_ns=0,
-        rule="join",
-        digest=bytes(8),
-        frame="",
-        final=True,
-        provisional=False,
-        exchange=0,
-        members=(),
-        missing=(),
-        joint=True,
-        ids=from_ids([]),
-        means=empty,
-        covariance=empty,
-        chi2=0.0,
-        dof=0,
-    )
-
-
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--robots", type=int, default=10)
     parser.add_argument("--hz", type=float, default=100.0)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--publish", nargs="+", help=argparse.SUPPRESS)
     told = parser.parse_args()
     if told.publish:

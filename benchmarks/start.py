@@ -9,7 +9,6 @@ by hand, ready and idle. in_bare_starts: in CPU of a start of Python with NumPy,
 machine.
 """
 
-import argparse
 import os
 import resource
 import subprocess
@@ -20,7 +19,7 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from benchmarks.baseline import conclude
+from benchmarks.baseline import conclude, parser_of
 from teamslam.sim.launch.launch import Plan, launch
 from teamslam.sim.launch.processes import PROGRAM
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -134,10 +133,9 @@ def measure_start(scenario: Scenario, words: list[str]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = parser_of(__doc__)
     parser.add_argument("--scenario", default="waypoints")
     parser.add_argument("--robots", type=int)
-    parser.add_argument("--json", type=Path)
     told = parser.parse_args()
     words = [told.scenario, *([] if told.robots is None else ["--robots", str(told.robots)])]
     figures = measure_start(with_options(load(told.scenario), robots=told.robots), words)
