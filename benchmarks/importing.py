@@ -48,7 +48,7 @@ def plain_s(bag: Path) -> float:
 
 def imported_s(bag: Path, folder: Path) -> float:
     began = time.perf_counter()
-    for robot in import_bag(bag, None, None).robots:
+    for robot in import_bag(bag, None, None).tables:
         robot.write(folder)
     return time.perf_counter() - began
 

@@ -341,17 +341,6 @@ def test_a_stream_of_another_team_or_start_is_not_delivered_to_this_one(tmp_path
     assert robot.path.with_name("r1.stream.1").exists()
 
 
-def test_a_driver_that_continues_a_stream_names_its_time_size_and_start(alone, caplog):
-    robot = alone(start=(5.0, 5.0, 1.0))
-    drive(robot, range(20))
-    count = len(messages(robot))
-    robot.close()
-    alone(start=(5.0, 5.0, 1.0)).close()
-    said = rf"continues \S*r1.stream of \d\d:\d\d, {count} measurements, start \(5, 5, 1\)"
-    assert re.search(said, caplog.text)
-    assert [each.levelname for each in caplog.records if "continues" in each.message] == ["WARNING"]
-
-
 @pytest.mark.parametrize("second", ["first", "second"])
 def test_a_stream_that_an_earlier_run_received_is_not_delivered_to_the_next(tmp_path, second):
     options = {"team": "lab", "file": tmp_path / "r1.stream", "start": (0.0, 0.0, 0.0)}

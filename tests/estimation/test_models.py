@@ -107,18 +107,6 @@ def test_two_wheels_make_one_error_of_way_and_turn_that_is_correlated_where_they
     )
 
 
-@quick
-@given(distance=distances, turn=st.floats(-2e-3, 2e-3))
-def test_the_arc_goes_over_into_the_straight_line(distance, turn):
-    model = MotionModel(kind="velocity", **NOISES)
-    bent, straight = (increment_of(model, 1.0, distance, t) for t in (turn, 0.0))
-    np.testing.assert_allclose(bent.mean, [distance, distance * turn / 2, turn], atol=1e-5)
-    np.testing.assert_allclose(bent.covariance, straight.covariance, atol=5e-5)
-    outside, inside = (increment_of(model, 1.0, distance, t) for t in (1.0001e-3, 0.9999e-3))
-    np.testing.assert_allclose(outside.covariance, inside.covariance, atol=1e-9)
-    np.testing.assert_allclose(outside.mean, inside.mean, atol=2e-6)
-
-
 def test_a_density_of_noise_does_not_depend_on_the_rate_of_the_odometry():
     model = MotionModel(kind="velocity", forward=MotionNoise(0.02, 0.03, 0.1), turn=NOISES["turn"])
     whole = increment_of(model, 2.0, 0.4, 0.3)

@@ -41,16 +41,6 @@ def test_however_an_increment_is_split_its_parts_compose_to_it(claim, cuts):
                                atol=1e-12)  # fmt: skip
 
 
-def test_the_densities_of_the_parts_of_an_increment_add_up_to_nearly_those_of_the_whole():
-    dense = MotionModel(forward=MotionNoise(0, 0.05), turn=MotionNoise(0, 0.02))
-    whole = interval([0.8, -0.3, 0.7])
-    one = part(whole, dense, SECOND, 0)
-    total = Increment.identity()
-    for k in range(100):
-        total = total.then(part(whole, dense, SECOND // 100, SECOND - (k + 1) * SECOND // 100))
-    np.testing.assert_allclose(np.diag(total.covariance), np.diag(one.covariance), rtol=0.2)
-
-
 @pytest.mark.parametrize("way", [1.5, -1.5])
 def test_an_increment_without_a_lateral_part_is_the_arc_of_its_speeds(way):
     wheels = MotionModel("differential-drive", wheel_base=0.5, left_wheel=0.1, right_wheel=0.02)

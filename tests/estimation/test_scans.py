@@ -39,27 +39,6 @@ def updated(scan) -> tuple[np.ndarray, np.ndarray]:
     return one_landmark.updated(MEAN, packed(SPREAD), POSE, seen, SENSOR, scan.own)[:2]
 
 
-def test_a_point_with_its_covariance_updates_a_landmark_as_the_kalman_filter_of_the_plane():
-    point = np.array([[2.5, 1.5]])
-    mean, P = updated(Scan.points(IDS.tobytes(), point.tobytes(), CLAIM.tobytes()))
-    H = turn(POSE[2]).T
-    S = H @ SPREAD @ H.T + full(CLAIM)
-    K = SPREAD @ H.T @ np.linalg.inv(S)
-    expected = MEAN + K @ (point[0] - H @ (MEAN - POSE[:2]))
-    np.testing.assert_allclose(mean, expected, atol=1e-12)
-    np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
-
-
-def test_a_range_and_bearing_with_a_correlation_update_a_landmark_as_an_ekf_does():
-    seen, R = np.array([4.0, 0.3]), np.array([[0.04, 0.006], [0.006, 0.002]])
-    mean, P = updated(polar(IDS, seen[:1], seen[1:], packed(R)))
-    r, b = predicted(POSE, MEAN)
-    H = core.predict(POSE, MEAN[None])[2][0]
-    K = SPREAD @ H.T @ np.linalg.inv(H @ SPREAD @ H.T + R)
-    np.testing.assert_allclose(mean, MEAN + K @ (seen - [r, b]), atol=1e-12)
-    np.testing.assert_allclose(full(P), SPREAD - K @ H @ SPREAD, atol=1e-12)
-
-
 def test_points_near_with_much_noise_place_a_landmark_without_a_bias():
     rng = np.random.default_rng(5)
     truth, sigma, count = np.array([0.6, 0.2]), 0.2, 4000

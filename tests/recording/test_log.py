@@ -58,18 +58,7 @@ def test_any_bytes_are_kept_as_they_came(tmp_path_factory, samples):
 
 def test_a_stamp_before_zero_comes_back_as_it_was(path):
     samples = [
-        sampled(
-            c.ODOMETRY,
-            "alpha",
-            build.odometry(
-                stamp_ns=stamp,
-                robot="alpha",
-                incarnation=0,
-                duration_ns=0,
-                forward=0.0,
-                yaw_rate=0.0,
-            ),
-        )
+        sampled(c.ODOMETRY, "alpha", build.odometry(stamp_ns=stamp, robot="alpha"))
         for stamp in (-(2**62), -5, 0, 5)
     ]
     log = recorded(path, samples[::-1])
@@ -87,10 +76,15 @@ def test_metadata_names_team_and_provenance(path):
         assert log.metadata[name]
 
 
-def test_a_recorder_never_overwrites(path):
+def test_a_recorder_never_overwrites_and_names_a_missing_folder_and_a_full_disk(path, monkeypatch):
     recorded(path, stream(1))
     with pytest.raises(RecorderError, match=r"log\.mcap exists: choose another name"):
         Recorder(path, "t", {})
+    with pytest.raises(RecorderError, match="No such file or directory; choose another place"):
+        Recorder(path.parent / "nowhere" / "log.mcap", "t", {})
+    monkeypatch.setattr(Path, "open", lambda self, mode: open("/dev/full", "wb"))  # noqa: SIM115 - the recorder closes it
+    with pytest.raises(RecorderError, match="No space left on device; choose another place"):
+        Recorder(path.parent / "full.mcap", "t", {})
 
 
 def test_a_log_is_found_by_the_folder_of_its_run(tmp_path):
@@ -259,14 +253,3 @@ def test_a_record_longer_than_any_of_ours_is_refused_unread(path):
         file.truncate(LARGEST_CHUNK + 2**20)
     with pytest.raises(LogError, match=f"record of {LARGEST_CHUNK + 1} bytes"):
         list(open_log(path).samples())
-
-
-def test_a_recorder_names_a_missing_folder(tmp_path):
-    with pytest.raises(RecorderError, match="No such file or directory; choose another place"):
-        Recorder(tmp_path / "nowhere" / "log.mcap", "t", {})
-
-
-def test_a_disk_that_is_full_at_once_is_told_at_once(path, monkeypatch):
-    monkeypatch.setattr(Path, "open", lambda self, mode: open("/dev/full", "wb"))  # noqa: SIM115 - the recorder closes it
-    with pytest.raises(RecorderError, match="No space left on device; choose another place"):
-        Recorder(path, "t", {})

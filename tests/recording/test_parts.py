@@ -30,10 +30,12 @@ from tests.recording.test_shell import FINAL, POSE, Team, logged
 from tests.support import odometry, received, submap, wait_until
 
 
-def killed_part(path: Path, samples: list[Sample]) -> None:
-    recorder = Recorder(path, "t", {"scenario": "s"})
+def killed_part(path: Path, samples: list[Sample]) -> Path:
+    """Write samples to the log's next part, whose recorder never completes it."""
+    recorder, _ = next_part(path, "t", {"scenario": "s"})
     recorder.write(samples)
-    wait_until(lambda: len(list(open_log(path).samples())) == len(samples))
+    wait_until(lambda: logged(recorder.path, c.ODOMETRY) == len(samples))
+    return recorder.path
 
 
 def test_a_recorder_that_is_killed_and_started_again_has_the_whole_run(path):
@@ -88,8 +90,7 @@ def test_a_log_that_is_not_of_this_run_is_not_continued(wrong, path, monkeypatch
     if wrong == "no log":
         path.write_bytes(b"my thesis")
     elif wrong == "finished":
-        with Recorder(path, "t", {"scenario": "s"}) as recorder:
-            recorder.write([Sample("central/final", encoded(FINAL), 0, 0, 0)])
+        final_part(path, 1, [])
     else:
         killed_part(path, samples_of(1))
     if wrong == "old":
@@ -99,18 +100,15 @@ def test_a_log_that_is_not_of_this_run_is_not_continued(wrong, path, monkeypatch
         check_continues(path, "t", {"scenario": scenario})
 
 
-def final_part(path: Path, part: int, samples: list[Sample]) -> Recorder:
+def final_part(path: Path, part: int, samples: list[Sample], final: str = "central/final") -> None:
     recorder, _ = next_part(path, "t", {"scenario": "s"})
     with recorder:
-        recorder.write([*samples, Sample("central/final", encoded(FINAL), 0, 0, 0)])
+        recorder.write([*samples, Sample(final, encoded(FINAL), 0, 0, 0)])
     assert recorder.path == part_of(path, part)
-    return recorder
 
 
 def in_two_parts(path: Path) -> None:
-    killed, _ = next_part(path, "t", {"scenario": "s"})
-    killed.write(samples_of(10)[:5])
-    wait_until(lambda: logged(path, c.ODOMETRY) == 5)
+    killed_part(path, samples_of(10)[:5])
     final_part(path, 2, samples_of(10)[5:])
 
 
@@ -128,9 +126,7 @@ def test_the_parts_of_a_log_are_read_as_one(path):
 
 
 def test_a_robots_final_map_ends_the_log_of_a_team_without_a_centre_only(path: Path) -> None:
-    recorder, _ = next_part(path, "t", {"scenario": "s"})
-    with recorder:
-        recorder.write([Sample(c.TEAM_FINAL.key("r1"), encoded(FINAL), 0, 0, 0)])
+    final_part(path, 1, [], c.TEAM_FINAL.key("r1"))
     assert check_continues(path, "t", {"scenario": "s"})
     with pytest.raises(LogError, match="exists, with the final map of its run"):
         check_continues(path, "t", {"scenario": "s"}, ends=(c.FINAL_MAP, c.TEAM_FINAL))
@@ -140,12 +136,8 @@ def test_a_robots_final_map_ends_the_log_of_a_team_without_a_centre_only(path: P
 def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice(
     path, removed, monkeypatch
 ):
-    killed, _ = next_part(path, "t", {"scenario": "s"})
-    killed.write(samples_of(10)[:3])
-    wait_until(lambda: logged(path, c.ODOMETRY) == 3)
-    again, _ = next_part(path, "t", {"scenario": "s"})
-    again.write(samples_of(10)[3:6])
-    wait_until(lambda: logged(again.path, c.ODOMETRY) == 3)
+    killed_part(path, samples_of(10)[:3])
+    killed_part(path, samples_of(10)[3:6])
     final_part(path, 3, samples_of(10)[6:])
     unlink = Path.unlink
     died = []
@@ -172,9 +164,7 @@ def test_a_joining_that_was_killed_while_it_removed_the_parts_adds_nothing_twice
 def test_a_part_of_another_log_is_neither_read_nor_joined_nor_removed(path):
     in_two_parts(path)
     path.unlink()  # and its second part stays
-    killed, _ = next_part(path, "t", {"scenario": "s"})
-    killed.write(samples_of(3))
-    wait_until(lambda: logged(path, c.ODOMETRY) == 3)
+    killed_part(path, samples_of(3))
     assert numbers(path) == [0, 1, 2]
     final_part(path, 3, samples_of(4)[3:])
     assert join_parts(path) == [path]
@@ -187,9 +177,7 @@ def test_a_clock_that_was_set_makes_no_log_another_run_s(path, step_s, monkeypat
     before = time.time
     with monkeypatch.context() as wrong:  # two hours behind, until the network told the time
         wrong.setattr(time, "time", lambda: before() - step_s)
-        killed, _ = next_part(path, "t", {"scenario": "s"})
-    killed.write(samples_of(1))
-    wait_until(lambda: logged(path, c.ODOMETRY) == 1)
+        killed_part(path, samples_of(1))
     old_s = before() - 7200.0
     os.utime(path, (old_s, old_s))
     if step_s:
@@ -343,16 +331,13 @@ RATE = 40
 def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("flips") / "log.mcap"
     samples = [
-        Sample(c.ODOMETRY.key("alpha"), encoded(odometry(i)), i, 10**18 + i * SECOND // RATE, i)
-        for i in range(20 * RATE)
-    ]
-    late = [
-        Sample(c.SUBMAP.key("alpha"), encoded(submap(i)), i, 10**18 + i * SECOND // 2, i)
-        for i in range(20)
+        Sample(channel.key("alpha"), encoded(message(i)), i, 10**18 + i * SECOND // rate, i)
+        for channel, message, rate in ((c.ODOMETRY, odometry, RATE), (c.SUBMAP, submap, 2))
+        for i in range(20 * rate)
     ]
     with Recorder(path, "t", {"scenario": "s"}) as recorder:
-        recorder.write([*samples, *late])
-    return path.read_bytes(), [*samples, *late]
+        recorder.write(samples)
+    return path.read_bytes(), samples
 
 
 def saved(path: Path) -> list[Sample]:

@@ -42,6 +42,15 @@ def drive(robot: str, seconds: int) -> list[Sample]:
     return out
 
 
+def status(counter: int, wall_s: float = 0, node: str = "central", **fields: object) -> Sample:
+    sample = sampled(c.STATUS, node, build.status(node=node, **fields), counter)
+    return msgspec.structs.replace(sample, wall_ns=10**18 + round(wall_s * SECOND) + counter)
+
+
+def later(samples: list[Sample], **fields: object) -> list[Sample]:
+    return [msgspec.structs.replace(s, wall_ns=s.wall_ns + SECOND, **fields) for s in samples]
+
+
 def found(log: Log) -> list[str]:
     return [str(finding) for finding in check_log(log)]
 
@@ -53,16 +62,6 @@ def whole(path):
 
 
 # Check.
-
-
-def status(counter: int, wall_s: int = 0, node: str = "central", **fields: object) -> Sample:
-    said = build.status(node=node, **fields)
-    sample = sampled(c.STATUS, node, said, counter)
-    return msgspec.structs.replace(sample, wall_ns=10**18 + wall_s * SECOND + counter)
-
-
-def later(samples: list[Sample], **fields: object) -> list[Sample]:
-    return [msgspec.structs.replace(s, wall_ns=s.wall_ns + SECOND, **fields) for s in samples]
 
 
 ONE, TWO = drive("alpha", 1), drive("alpha", 2)
@@ -165,69 +164,61 @@ def test_a_cut_log_lacks_nothing_outside_of_its_cut(path, samples):
 def test_a_process_without_a_last_word_is_named(path):
     """A killed robot's second life reports its totals; those of the first are unknown."""
 
-    def status(counter: int, wall_s: int) -> Sample:
-        said = build.status(stamp_ns=counter * 10**9, node="robot/alpha")
-        return msgspec.structs.replace(
-            sampled(c.STATUS, "robot/alpha", said, counter), wall_ns=wall_s * 10**9
-        )
+    node = "robot/alpha"
 
-    def tally(node: str, since_s: int, until_s: int, count: int) -> Sample:
-        keys = (f"{node}/status",)
-        said = build.tally(node=node, since_ns=since_s * 10**9, keys=keys, counts=(count,))
-        return msgspec.structs.replace(sampled(c.TALLY, node, said, 0), wall_ns=until_s * 10**9)
+    def tally(since_s: int, until_s: int, count: int) -> Sample:
+        since_ns, until_ns = (10**18 + s * SECOND for s in (since_s, until_s))
+        said = build.tally(node=node, since_ns=since_ns, keys=(f"{node}/status",), counts=(count,))
+        return msgspec.structs.replace(sampled(c.TALLY, node, said, 0), wall_ns=until_ns)
 
-    first = [status(k, 10 + k) for k in range(3)]
-    second = [status(k, 20 + k) for k in range(2)]
-    last = tally("robot/alpha", 19, 23, 2)
+    first = [status(k, 10 + k, node, stamp_ns=k * SECOND) for k in range(3)]
+    second = [status(k, 20 + k, node, stamp_ns=k * SECOND) for k in range(2)]
+    last = tally(19, 23, 2)
     (named,) = found(recorded(path, [*first, *second, last]))
     assert named.startswith("robot/alpha/tally: the process with messages until 2.0 s announced")
-    both = [*first, *second, tally("robot/alpha", 9, 13, 3), last]
+    both = [*first, *second, tally(9, 13, 3), last]
     assert found(recorded(path.with_name("both.mcap"), both)) == []
     assert found(recorded(path.with_name("memory.mcap"), first)) == []
 
 
+def missing(samples: list[Sample]) -> int:
+    counters = Counters()
+    for sample in samples:
+        counters.take(sample)
+    counted = [line.split(" missing")[0].split()[0] for line in counters.findings(part=False)]
+    return sum(map(int, counted))
+
+
+kept_of_lives = st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4)
+
+
+def lost_of(lives: list[set[int]]) -> int:
+    return sum(max(kept, default=0) - len(kept) for kept in lives)
+
+
 @settings(deadline=None, max_examples=150)
-@given(st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4), st.randoms())
+@given(kept_of_lives, st.randoms())
 def test_in_any_order_of_arrival_as_many_are_missing_as_were_lost(lives, rng):
     samples = [
         Sample("source/alpha/odometry", b"", 0, 1_000 * life + counter, counter)
         for life, kept in enumerate(lives)
         for counter in (0, *rng.sample(sorted(kept), len(kept)))
     ]
-    lost = sum(max(kept, default=0) - len(kept) for kept in lives)
-    counters = Counters()
-    for sample in samples:
-        counters.take(sample)
-    lines = counters.findings(part=False)
-    assert [line.split(" missing")[0].split()[0] for line in lines] == ([str(lost)] if lost else [])
-
-
-def set_back(samples: list[Sample], after: int, seconds: int) -> list[Sample]:
-    return [
-        msgspec.structs.replace(s, wall_ns=s.wall_ns - (k >= after) * seconds * 10**9)
-        for k, s in enumerate(samples)
-    ]
+    assert missing(samples) == lost_of(lives)
 
 
 @settings(deadline=None, max_examples=300)
-@given(
-    st.lists(st.sets(st.integers(1, 30), max_size=12), min_size=1, max_size=4),
-    st.integers(0, 60),
-    st.integers(-100, 100),
-)
+@given(kept_of_lives, st.integers(0, 60), st.integers(-100, 100))
 def test_wherever_a_clock_is_set_as_many_are_missing_as_were_lost(lives, after, seconds):
     """A message a second, in the order of arrival; each life is identified by its message 0."""
+    said = [(life, n) for life, kept in enumerate(lives) for n in sorted({0, *kept})]
     samples = [
-        Sample("robot/alpha/status", b"", 0, (40 * life + counter) * 10**9, counter)
-        for life, kept in enumerate(lives)
-        for counter in sorted({0, *kept})
+        Sample(
+            "robot/alpha/status", b"", 0, (40 * life + n - (k >= after) * seconds) * SECOND + k, n
+        )
+        for k, (life, n) in enumerate(said)
     ]
-    lost = sum(max(kept, default=0) - len(kept) for kept in lives)
-    counters = Counters()
-    for k, sample in enumerate(set_back(samples, after, seconds)):
-        counters.take(msgspec.structs.replace(sample, wall_ns=sample.wall_ns + k))
-    lines = counters.findings(part=False)
-    assert [line.split(" missing")[0].split()[0] for line in lines] == ([str(lost)] if lost else [])
+    assert missing(samples) == lost_of(lives)
 
 
 def test_a_publication_that_came_as_a_reply_is_not_missing():
@@ -349,34 +340,28 @@ def test_robots_own_logs_merge_once_and_stably(tmp_path):
     }  # fmt: skip
 
 
+def test_damage_is_told_before_a_new_log_is_made_and_logs_of_two_teams_are_not_merged(
+    whole, tmp_path
+):
+    with Recorder(tmp_path / "u.mcap", "u", {}) as recorder:
+        recorder.write(drive("alpha", 1))
+    with pytest.raises(LogError, match=r"u\.mcap: a log of team 'u', not 't' as .*log\.mcap is"):
+        merge([whole, open_log(tmp_path / "u.mcap")], tmp_path / "a.mcap")
+    ((offset, length),) = chunks_of(whole.path)
+    flip(whole.path, offset + length - 5)
+    with pytest.raises(LogError, match=r"damaged chunk .* log repair` saves the rest"):
+        cut(whole, tmp_path / "a.mcap", 1.0)
+    with pytest.raises(LogError, match="damaged chunk"):
+        merge([whole], tmp_path / "a.mcap")
+    assert not (tmp_path / "a.mcap").exists()
+
+
 # CSV.
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
-
-
-@settings(deadline=None, max_examples=25)
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 2**31 - 1), st.floats(0, 1e9), st.floats(-3.14, 3.14)), max_size=5
-    )
-)
-def test_numbers_read_back_from_csv_are_the_same(tmp_path_factory, seen):
-    folder = tmp_path_factory.mktemp("csv")
-    ids, ranges, bearings = ([row[i] for row in seen] for i in range(3))
-    message = build.observations(
-        stamp_ns=5, robot="alpha", number=9, ids=ids, ranges=ranges, bearings=bearings
-    )
-    log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
-    export_tables(log, folder / "out")
-    (row,) = rows_of(folder / "out" / "observations.csv")
-    assert (row["key"], row["counter"], row["number"]) == ("source/alpha/observations", "3", "9")
-    assert from_ids([int(word) for word in row["ids"].split()]) == message.ids
-    for name in ("ranges", "bearings"):
-        back = np.array([float(word) for word in row[name].split()])
-        assert from_floats(back) == getattr(message, name)
 
 
 @pytest.mark.parametrize("write", [from_derivatives, from_floats], ids=["float32", "float64"])
@@ -394,6 +379,25 @@ def test_a_submaps_derivatives_are_exported_at_the_width_that_they_have(write, t
     (row,) = rows_of(tmp_path / "out" / "submap.csv")
     assert [float(word) for word in row["sensitivity"].split()] == sensitivity.tolist()
     assert [float(word) for word in row["curvature"].split()] == curvature.tolist()
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2**31 - 1), st.floats(0, 1e9), st.floats(-3.14, 3.14)), max_size=5
+    )
+)
+def test_numbers_read_back_from_csv_are_the_same(tmp_path_factory, seen):
+    folder = tmp_path_factory.mktemp("csv")
+    fields = dict(zip(("ids", "ranges", "bearings"), zip(*seen, strict=True), strict=False))
+    message = build.observations(stamp_ns=5, robot="alpha", number=9, **fields)
+    log = recorded(folder / "log.mcap", [sampled(c.OBSERVATIONS, "alpha", message, 3)])
+    export_tables(log, folder / "out")
+    (row,) = rows_of(folder / "out" / "observations.csv")
+    assert (row["key"], row["counter"], row["number"]) == ("source/alpha/observations", "3", "9")
+    for name, kind in zip(fields, (int, float, float), strict=False):
+        back = [kind(word) for word in row[name].split()]
+        assert (from_ids if kind is int else from_floats)(back) == getattr(message, name)
 
 
 def test_every_channel_becomes_a_table_and_what_is_unsound_is_counted(tmp_path):
@@ -420,20 +424,3 @@ def test_unsound_messages_are_counted_and_the_first_is_explained(path):
     samples[3:5] = drive("alpha", 1)[3:5]
     (line,) = found(recorded(path.with_name("b.mcap"), samples))
     assert line.endswith("message 4: logged at 5 ns, of 100400000000 ns")
-
-
-def test_damage_is_told_before_a_new_log_is_made(whole, tmp_path):
-    ((offset, length),) = chunks_of(whole.path)
-    flip(whole.path, offset + length - 5)
-    with pytest.raises(LogError, match=r"damaged chunk .* log repair` saves the rest"):
-        cut(whole, tmp_path / "a.mcap", 1.0)
-    with pytest.raises(LogError, match="damaged chunk"):
-        merge([whole], tmp_path / "a.mcap")
-    assert not (tmp_path / "a.mcap").exists()
-
-
-def test_logs_of_two_teams_are_not_merged(whole, tmp_path):
-    with Recorder(tmp_path / "u.mcap", "u", {}) as recorder:
-        recorder.write(drive("alpha", 1))
-    with pytest.raises(LogError, match=r"u\.mcap: a log of team 'u', not 't' as .*log\.mcap is"):
-        merge([whole, open_log(tmp_path / "u.mcap")], tmp_path / "m.mcap")

@@ -42,14 +42,6 @@ def test_a_gap_is_asked_for_after_a_while_and_again_later_and_later():
     assert waits == sorted(waits)
 
 
-def test_the_tail_that_only_a_heartbeat_speaks_of_is_asked_for():
-    arrivals: Arrivals[int] = Arrivals(0)
-    arrivals.take(0, 0)
-    arrivals.know(2)
-    assert arrivals.due(0.0) is None
-    assert arrivals.due(PATIENCE_S) == (1, 2)
-
-
 def test_what_waits_behind_a_gap_goes_on_after_a_while():
     arrivals: Arrivals[int] = Arrivals(0)
     assert arrivals.take(1, 1) == arrivals.take(2, 2) == []

@@ -162,16 +162,9 @@ def test_the_pages_program_reads_a_submap_from_a_live_team():
 
 
 def test_the_pages_example_bytes_are_those_of_the_code():
-    assert encoded(
-        build.odometry(
-            stamp_ns=1_000,
-            robot="alpha",
-            number=2,
-            duration_ns=100_000_000,
-            forward=0.25,
-            yaw_rate=-0.125,
-        )
-    ).hex(" ") in (PAGE.read_text().replace("\n", " "))
+    said = {"robot": "alpha", "number": 2, "forward": 0.25, "yaw_rate": -0.125}
+    driven = build.odometry(stamp_ns=1_000, duration_ns=100_000_000, **said)
+    assert encoded(driven).hex(" ") in PAGE.read_text().replace("\n", " ")
 
 
 if __name__ == "__main__":

@@ -59,9 +59,7 @@ def test_who_shows_a_message_to_people_gets_printable_texts_and_the_same_message
     json = '{\n  "a": 1}'
     configured = build.configuration(incarnation=0, configuration=json)
     key = ch.ROBOT_CONFIG.key("r1")
-    assert open_printable(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, (
-        "is data, not words"
-    )
+    assert open_printable(Sample(key, encoded(configured), 0, 0, 0))[2] == configured, "data"
 
 
 def test_a_launch_keeps_no_control_character_of_others_for_its_terminal():

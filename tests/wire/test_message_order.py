@@ -18,10 +18,7 @@ vectors = st.dictionaries(st.sampled_from(["r1", "r2", "r3"]), st.integers(0, 3)
 
 
 def members(vector: dict[str, int]) -> tuple[m.VersionEntry, ...]:
-    return tuple(
-        m.VersionEntry(robot=robot, incarnation=1, sequence=vector[robot])
-        for robot in sorted(vector)
-    )
+    return build.version(**dict(sorted(vector.items())))
 
 
 def prior(vector: dict[str, int], heard: int = 0, incarnation: int = 1) -> m.Prior:
@@ -86,12 +83,7 @@ def test_progress_never_goes_back(said):
 
 def test_an_older_end_does_not_take_measurements_back():
     first = build.end(1, r1=90, r2=40)
-    later = m.End(
-        stamp_ns=2,
-        streams=(
-            m.StreamEnd(robot="r1", incarnation=2, measurements=10),
-            m.StreamEnd(robot="r2", incarnation=1, measurements=50),
-        ),
-    )
+    anew, further = build.end(2, 2, r1=10), build.end(2, r2=50)
+    later = msgspec.structs.replace(anew, streams=anew.streams + further.streams)
     assert merge_ends(first, later).streams == later.streams
     assert merge_ends(later, first).streams == later.streams

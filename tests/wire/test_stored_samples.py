@@ -23,13 +23,7 @@ def order(number: int) -> Sample:
     return sample(ch.GIVEN_UP, "robot/r1", msgspec.structs.replace(GIVEN_UP, reason=f"{number}"))
 
 
-def of(
-    stored: StoredMessages,
-    *channels: ch.Channel,
-    now_s: float = 0.0,
-    run_s: float = 0.0,
-    node: str = "",
-) -> list[Sample]:
+def of(stored, *channels, now_s=0.0, run_s=0.0, node=""):
     request = build.kept_request(
         channels=tuple(c.name for c in channels), node=node, run_ns=round(run_s * S)
     )
@@ -99,17 +93,11 @@ def test_who_never_announced_its_end_has_missed_the_teams_until_it_does():
     stored.last_word("late")
     for node, missed in (("killed", True), ("killed", True), ("well", False), ("late", False)):
         assert of(stored, *ch.ENDS, now_s=13.0, node=node) == [final] * missed, node
+    assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=2.9) == []
+    assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=3.1) == [final], "its run is older"
     stored.token("killed", alive=True)
     stored.last_word("killed")
     assert of(stored, *ch.ENDS, now_s=13.0, node="killed") == []
-
-
-def test_an_end_is_sent_to_whose_run_is_older():
-    stored = StoredMessages()
-    final = sample(ch.FINAL_MAP, "", FINAL)
-    stored.take(final, 10.0)
-    assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=2.9) == []
-    assert of(stored, ch.FINAL_MAP, now_s=13.0, run_s=3.1) == [final]
 
 
 def test_every_order_of_an_operator_is_stored_with_its_signature():

@@ -49,11 +49,8 @@ def flowing(source: ZenohBus, sink: ZenohBus, *channels: c.Channel) -> None:
 
 
 def progress(i: int) -> Outgoing:
-    return Outgoing(
-        c.ROBOT_PROGRESS,
-        "alpha",
-        build.progress(stamp_ns=i, robot="alpha", incarnation=0, measurements=i),
-    )
+    said = build.progress(stamp_ns=i, robot="alpha", incarnation=0, measurements=i)
+    return Outgoing(c.ROBOT_PROGRESS, "alpha", said)
 
 
 def counters(samples: list[Sample], key: str) -> list[int]:
@@ -92,9 +89,8 @@ def test_a_killed_process_loses_its_token(endpoint):
         watcher.watch_alive()
         assert opened(received(watcher, 1)[0])[2] == build.liveliness(node="robot/alpha")
         child.kill()
-        assert opened(received(watcher, 1)[0])[2] == build.liveliness(
-            node="robot/alpha", alive=False
-        )
+        gone = build.liveliness(node="robot/alpha", alive=False)
+        assert opened(received(watcher, 1)[0])[2] == gone
 
 
 def python(program: str) -> subprocess.Popen[str]:
@@ -175,13 +171,9 @@ def test_a_payload_beyond_the_limit_is_not_sent(endpoint):
 
 
 def test_a_publication_without_its_attachment_is_dropped_and_logged(endpoint, caplog):
-    config = zenoh.Config.from_json5(
-        f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}, '
-        "scouting: {multicast: {enabled: false}}}"
-    )
     with ZenohBus("t", endpoint) as source, ZenohBus("t", endpoint) as sink:
         flowing(source, sink, c.ODOMETRY)
-        with zenoh.open(config) as stranger:
+        with client(endpoint, 5.0, None) as stranger:
             stranger.put("team/t/source/alpha/odometry", encoded(odometry(0)))
         wait_until(lambda: sink.receive(0.02) == [] and bool(caplog.records))
         assert sink.dropped == 1
@@ -391,7 +383,7 @@ def test_who_wants_the_whole_of_a_key_gets_what_was_said_before_it_came(endpoint
 
 
 def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, monkeypatch):
-    first, final = (f for f in [FINAL, msgspec.structs.replace(FINAL, dof=99)])
+    first, final = FINAL, msgspec.structs.replace(FINAL, dof=99)
     with ZenohBus("t", endpoint) as centre, ZenohBus("other", endpoint) as stranger:
         assert EndQuery(centre).find_missed() == []
         centre.publish(Outgoing(c.FINAL_MAP, "", first))
@@ -403,29 +395,21 @@ def test_the_router_keeps_the_final_map_of_each_team_for_who_was_away(endpoint, 
         assert decoded(sample.payload, m.FusedMap) == final
         assert (sample.key, sample.stamp_ns) == (c.FINAL_MAP.key(), final.stamp_ns)
         monkeypatch.setattr(end_query, "_STARTED", time.monotonic())
-        assert EndQuery(straggler).find_missed() == [], (
-            "a process begins that knows nothing of that run"
-        )
+        assert EndQuery(straggler).find_missed() == [], "it begins and knows nothing of that run"
         monkeypatch.setenv(end_query.SINCE, str(time.time_ns() - 60 * 10**9))
-        assert EndQuery(straggler).find_missed(), (
-            "whoever started it says that it belongs to that run"
-        )
+        assert EndQuery(straggler).find_missed(), "its parent says that it belongs to that run"
 
 
 def test_keys_of_no_channel_are_dropped_and_counted_before_anything_is_stored(endpoint, caplog):
-    status = build.status(state="x")
-    with (
-        ZenohBus("t", endpoint) as sink,
-        ZenohBus("t", endpoint) as source,
-        client(endpoint, 5.0, None) as session,
-    ):
+    buses = ZenohBus("t", endpoint), ZenohBus("t", endpoint)
+    with buses[0] as sink, buses[1] as source, client(endpoint, 5.0, None) as session:
         flowing(source, sink, c.STATUS)
         for k in range(3_000):
             deep = f"team/t/robot/r1/x{k}/status"
             odd = f"team/t/robot/X{k}/status"  # as many parts as a status key, of no node
             for key in (deep, odd):
                 session.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)
-        assert source.publish(Outgoing(c.STATUS, "robot/r1", status))
+        assert source.publish(Outgoing(c.STATUS, "robot/r1", build.status()))
         assert [sample.key for sample in received(sink, 1)] == ["robot/r1/status"]
         wait_until(lambda: sink.receive(0.02) == [] and sink.dropped == 3_000)
     assert "no channel has this key" in caplog.text
@@ -442,8 +426,7 @@ def test_a_bus_receives_samples_of_a_bounded_number_of_keys(endpoint, monkeypatc
         def dropped() -> bool:
             for k in range(6):
                 node = f"robot/r{k}"
-                status = build.status(node=node, state="x")
-                source.publish(Outgoing(c.STATUS, node, status))
+                source.publish(Outgoing(c.STATUS, node, build.status(node=node)))
             seen.update(sample.key for sample in sink.receive(0.02))
             return sink.dropped >= 6
 

@@ -13,7 +13,6 @@ from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam, OpenWindow
 from teamslam.team.estimation.models import increment_of, predicted
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.wire import messages as m
-from tests import build
 from tests.teams import config, published, stream
 
 MEASUREMENTS = published(stream("r1", 12, off_ns=300_000_000))
@@ -26,14 +25,7 @@ def fed(slam, measurements):
         if isinstance(measurement, m.Observations):
             slam.observe(measurement.stamp_ns, translate.scan_of(measurement))
         if isinstance(measurement, m.Odometry):
-            window = slam.drive(
-                OdometryInterval(
-                    measurement.stamp_ns,
-                    measurement.duration_ns,
-                    measurement.forward,
-                    measurement.yaw_rate,
-                )
-            )
+            window = slam.drive(translate.interval_of(measurement, config()))
             closed += [] if window is None else [window]
     return closed
 
@@ -80,26 +72,6 @@ def test_after_a_resume_the_following_windows_are_the_same_byte_for_byte(taken, 
     again = fed(slam, MEASUREMENTS[first:])
     assert len(again) == len(whole) - taken
     assert all(same(a, b) for a, b in zip(again, whole[taken:], strict=True))
-
-
-def test_a_window_does_not_depend_on_what_was_read_before_it():
-    other = [
-        build.odometry(
-            stamp_ns=r.stamp_ns,
-            robot=r.robot,
-            incarnation=r.incarnation,
-            number=r.number,
-            duration_ns=r.duration_ns,
-            forward=2 * r.forward,
-            yaw_rate=0.5,
-        )
-        if isinstance(r, m.Odometry) and r.stamp_ns <= 3_000_000_000
-        else r
-        for r in MEASUREMENTS
-    ]
-    one, two = fed(fresh(), MEASUREMENTS), fed(fresh(), other)
-    assert not same(one[0], two[0])
-    assert all(same(a, b) for a, b in zip(one[1:], two[1:], strict=True))
 
 
 def standing(window_m):

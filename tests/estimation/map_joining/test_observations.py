@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
-from teamslam.team.estimation.map_joining.hypotheses import FAR, change_of, sights_of
 from tests.estimation.sighting_world import joined_with
 from tests.estimation.submap_world import solved, team
 
@@ -41,42 +40,3 @@ def test_an_observation_has_the_covariance_of_the_start_pose_and_its_own(island)
             np.testing.assert_allclose(spread[row], expected[[0, 0, 1], [0, 1, 1]], rtol=1e-5)
             row += 1
     assert row == len(points) > 20
-
-
-def test_landmarks_whose_observations_scatter_beyond_a_bound_are_tabulated(island):
-    everything = sights_of(island)
-    assert everything.keys() == island.graph.landmarks.keys()
-    scatter = {}
-    for id_, own in everything.items():
-        assert (np.diff(own.end_ns) >= 0).all()
-        away = own.points - np.median(own.points, axis=0)
-        blocks = own.spread[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        chi2 = np.einsum("ni,nij,nj->n", away, np.linalg.inv(blocks), away)
-        scatter[id_] = np.minimum(chi2, FAR).sum()
-    bound = float(np.median(list(scatter.values()))) + 1e-9
-    beyond = sights_of(island, bound)
-    assert beyond.keys() == {id_ for id_, chi2 in scatter.items() if chi2 > bound}
-    for id_, own in beyond.items():
-        np.testing.assert_array_equal(own.points, everything[id_].points)
-
-
-def test_a_landmark_changes_its_place_where_two_medians_leave_least(island):
-    def left(own, part):
-        away = own.points[part] - np.median(own.points[part], axis=0)
-        blocks = own.spread[part][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        chi2 = np.einsum("ni,nij,nj->n", away, np.linalg.inv(blocks), away)
-        return np.minimum(chi2, FAR).sum()
-
-    for own in sights_of(island).values():
-        n = len(own.places)
-        found = change_of(own)
-        if n < 4:
-            assert found is None
-            continue
-        gains = {
-            at: left(own, slice(n)) - left(own, slice(at)) - left(own, slice(at, n))
-            for at in range(2, n - 1)
-        }
-        best = max(gains, key=gains.get)
-        assert found.evidence == pytest.approx(gains[best])
-        np.testing.assert_array_equal(found.second, np.arange(n) >= best)

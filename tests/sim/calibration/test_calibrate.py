@@ -17,10 +17,8 @@ from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
 from teamslam.sim.calibration.sensor import fit_sensor
 from teamslam.sim.datasets.utias import write_utias
-from teamslam.sim.scenarios.scenario import Scenario, load, with_options
-from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.world.streams import Intervals, grouped
-from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.commands import output_of, run
 from tests.sim.logs import scenario, streams
 
@@ -229,41 +227,12 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
     assert "# defaults.sensor.bearing_outliers: 0 ± 0" in elsewhere.read_text("utf-8")
 
 
-@pytest.fixture(scope="module")
-def slipping():
-    world = SimulatedWorld(
-        steps=840,
-        step_s=0.25,
-        size_m=20.0,
-        landmark_count=12,
-        speed_m_s=0.4,
-        turn_rate_rad_s=0.5,
-        visible_from_m=1.0,
-        visible_to_m=12.0,
-    )
-    motion = MotionModel(forward=MotionNoise(per_m=0.05), turn=MotionNoise(per_rad=0.05))
-    sensor = Sensor(range_sigma=0.05, bearing_sigma=0.01)
-    front_end = FrontEnd(window_s=5.0, particles=30, keyframe_s=0.5)
-    robots = tuple(RobotConfig(f"r{i}", motion, sensor, front_end) for i in (1, 2))
-    team = with_options(
-        Scenario(name="slipping", team="slipping", world=world, robots=robots), seed=3
-    )
-    told = streams(team)
-    less = tuple(
-        replace(each, intervals=replace(each.intervals, forward=each.intervals.forward / 1.1))
-        for each in told.streams
-    )
-    return team, replace(told, streams=less)
-
-
-def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(
-    slipping, tmp_path
-):
-    write_utias(slipping[1], tmp_path / "set")
+def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(tmp_path):
+    write_utias(streams(scenario(robots=2)), tmp_path / "set")
     (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
     said = output_of("calibrate", tmp_path / "set", status=1)
     assert "set r2: no ground truth: nothing is learnt from it" in said
-    assert "these data have 20: give several data sets at once, record 1.7 minutes" in said
+    assert "these data have 2: give several data sets at once, record 4.7 minutes" in said
     assert "where the path is known throughout" in said
 
 

@@ -5,7 +5,6 @@ import pytest
 
 from teamslam.sim.cli.commands import WRONG_USE
 from teamslam.sim.cli.main import main
-from tests.support import ROOT
 
 
 def message_in(said: str, status: object) -> str:
@@ -41,6 +40,7 @@ def told(monkeypatch, tmp_path, capfd):
             ["hybrid-thesis can not feed the rule join", "valid:", "kalman-per-axis"],
         ),
         (["launch", "thesis", "--fusion", "mean"], ["'mean' at fusion", "covariance-intersection"]),
+        (["launch", "thesis", "--seed", "-1"], ["expected int >= 0 at seed"]),
         (["launch", "thesis", "--speed", "banana"], ["--speed banana", "positive number, or max"]),
         (["launch", "thesis", "--speed", "-1"], ["--speed -1", "positive number, or max"]),
         (["launch", "--dataset", "nowhere.zip"], ["nowhere.zip: no such file or folder"]),
@@ -76,33 +76,16 @@ def test_wrong_use_is_told_with_what_to_do(arguments, parts, told):
 
 
 @pytest.mark.parametrize(
-    ("text", "parts"),
+    ("text", "arguments", "said"),
     [
-        ('base = "thesis"\nrobotcount = 2', ["unknown field `robotcount`", "robot_count"]),
-        ('base = "thesis"\n[world]\nsteps = "many"', ["world.steps", "int", "str"]),
-        ('base = "thesis"\n[defaults.sensor]\nrange_sigma = -1', ["range_sigma"]),
-        ('base = "thesis"\nseed = nan', ["seed"]),
-        ("steps =", ["not valid TOML"]),
+        ("robotcount = 2", ["launch", "mine"], "mine: unknown field `robotcount`; known: name"),
+        ("steps =", ["launch", "mine"], "mine: not valid TOML"),
+        ("", ["replay", "mine"], "mine: empty file"),
+        ("no log", ["repair", "mine", "--output", "out"], "mine: not an MCAP file"),
     ],
 )
-def test_a_mistake_in_a_scenario_is_told_with_its_file_and_field(text, parts, told):
-    Path("mine.toml").write_text(text)
-    message = told("launch", "mine.toml")
-    assert [part for part in ["mine.toml: ", *parts] if part not in message] == [], message
-
-
-EMPTY, FOREIGN = b"", (ROOT / "README.md").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("command", "content", "what"),
-    [
-        (["replay"], EMPTY, "empty file"),
-        (["replay"], FOREIGN, "not an MCAP file"),
-        (["report", "--output", "out"], EMPTY, "empty file"),
-        (["repair", "--output", "out"], FOREIGN, "not an MCAP file"),
-    ],
-)
-def test_what_is_no_log_is_told(command, content, what, told):
-    Path("mine.mcap").write_bytes(content)
-    assert f"mine.mcap: {what}" in told(*command, "mine.mcap")
+def test_a_mistake_in_a_file_is_told_with_its_name(text, arguments, said, told):
+    name = "mine.toml" if arguments[0] == "launch" else "mine.mcap"
+    Path(name).write_text(text)
+    arguments = [name if each == "mine" else each for each in arguments]
+    assert said.replace("mine", name) in told(*arguments)

@@ -1,7 +1,6 @@
 import dataclasses
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -9,7 +8,6 @@ from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
@@ -354,17 +352,6 @@ def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path):
     kept, said = with_present_robots(scenario)
     assert [robot.id for robot in kept.robots] == ["alice"]
     assert said.startswith("bob: no files in")
-
-
-def test_a_team_maps_a_folder_as_it_maps_the_world_that_was_written(tmp_path):
-    scenario = with_options(load("waypoints"), robots=1)
-    world = scenario.world
-    scenario = msgspec.structs.replace(scenario, world=msgspec.structs.replace(world, steps=25))
-    streams = streams_of(scenario)
-    write_folder(streams, tmp_path)
-    again = msgspec.structs.replace(scenario, world=FolderWorld(path=str(tmp_path)))
-    first = final_map(list(run_team(scenario, streams)))
-    assert final_map(list(run_team(again, streams_of(again)))) == first
 
 
 def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path):

@@ -6,11 +6,10 @@ from click.testing import CliRunner
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.cli.main import _advice, app
-from teamslam.sim.datasets.graph import graph_world, read_graph, read_pyfg
+from teamslam.sim.datasets.graph import graph_world, read_graph
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.in_memory.team import run_team
-from teamslam.sim.recorded.export import g2o_lines, isam_lines, pyfg_lines
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.sim.world.config import GraphWorld
@@ -142,25 +141,6 @@ def test_a_team_maps_a_graph(tmp_path, robots):
     joined = evaluate(run_team(final_only(scenario), streams_of(scenario))).map
     assert len(joined.ids) == len(read_graph(path).landmarks)
     assert joined.errors.rmse_m < 0.2
-
-
-def test_what_is_written_is_read_back(tmp_path):
-    graph = read_graph(written(tmp_path, drive()))
-    from teamslam.sim.datasets.factor_graph import place_by_odometry
-
-    place_by_odometry(graph)
-    graph.stamps_ns = {key: key[1] * 10**9 for key in graph.poses}
-    texts = {"a.txt": isam_lines(graph, ""), "a.g2o": g2o_lines(graph), "a.pyfg": pyfg_lines(graph)}
-    for name, lines in texts.items():
-        path = written(tmp_path, "\n".join(lines), name)
-        again = (read_pyfg if name == "a.pyfg" else read_graph)(path)
-        for new, old in zip(again.pose_edges, graph.pose_edges, strict=True):
-            assert np.allclose(new.motion, old.motion)
-            assert np.allclose(new.covariance, old.covariance)
-        for seen, old_seen in zip(again.point_edges, graph.point_edges, strict=True):
-            assert seen.landmark == old_seen.landmark
-            assert np.allclose(seen.point, old_seen.point)
-            assert np.allclose(seen.covariance, old_seen.covariance)
 
 
 @pytest.mark.parametrize(

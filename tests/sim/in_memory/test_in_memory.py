@@ -2,16 +2,9 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
-from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.scenarios.source import streams_of
-from teamslam.team import translate
-from teamslam.team.pairs import PAIRS
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire.bus import opened
 from tests.scenarios import with_world
 from tests.support import ROOT
 
@@ -19,34 +12,6 @@ from tests.support import ROOT
 def thesis(estimator, fusion, seed=1, steps=30):
     scenario = with_options(load("thesis"), seed=seed, estimator=estimator, fusion=fusion)
     return with_world(scenario, steps=steps)
-
-
-def run(*args, **options):
-    scenario = thesis(*args, **options)
-    return list(run_team(scenario, streams_of(scenario)))
-
-
-@pytest.mark.parametrize(("estimator", "fusion"), sorted(PAIRS))
-def test_the_thesis_team_ends_with_a_map_of_finite_values(estimator, fusion):
-    samples = run(estimator, fusion)
-    fused = final_map(samples)
-    assert fused.final
-    ids, means = translate.landmarks_of(fused)
-    covariance = translate.landmark_covariance_of(fused)
-    assert (len(ids) > 10) == (fusion != "alone")
-    assert bool(fused.reasons) == (fusion in ("kalman", "kalman-per-axis", "alone"))
-    assert np.isfinite(means).all()
-    assert np.isfinite(covariance).all()
-    assert (np.diag(covariance) > 0.0).all()
-    assert sum(s.key == ch.FINAL_MAP.key() for s in samples) == 1
-    consumed = {}
-    for sample in samples:
-        channel, name, message = opened(sample)
-        if channel is ch.ROBOT_DONE:
-            assert sum(e.measurements for e in message.ledger) == message.measurements
-            consumed[name] = message.measurements
-    (end,) = (opened(s)[2] for s in samples if s.key == ch.END.key())
-    assert consumed == {s.robot: s.measurements for s in end.streams}
 
 
 WORLD = """

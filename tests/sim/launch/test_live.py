@@ -1,15 +1,11 @@
 from io import StringIO
 
-import msgspec
-import numpy as np
-import pytest
 from rich.console import Console
 
 from teamslam.sim.launch import live
 from teamslam.sim.launch.watch import Watch
 from teamslam.team.wire import messages as m
 from tests import build
-from tests.support import fused_map
 
 
 def status(node: str, state: str, *warnings: str, **figures: float) -> m.Status:
@@ -71,51 +67,10 @@ def test_a_live_team_names_the_drivers_that_it_waits_for_what_to_start_and_repea
     assert any("the driver of r2 is away" in line for line in printed(watch, 300))
 
 
-def told(robots: int) -> Watch:
-    watch = Watch(robots=tuple(f"r{k}" for k in range(1, robots + 1)))
-    watch.statuses["world"] = status("world", "publishing", measurements=5.0, of=10.0)
-    watch.statuses["central"] = status("central", "joining", joint_cost_per_dof=1.07, submaps=9.0)
-    for k in range(1, robots + 1):
-        watch.statuses[f"robot/r{k}"] = status(
-            f"robot/r{k}", "mapping", steps=12345.0, submaps=1234.0, landmarks=1000.0,
-            pose_sigma_m=12.34, nis_per_dof=1.05, messages_per_s=1500.0, bytes_per_s=150_000.0,
-        )  # fmt: skip
-    watch.fused = fused_map(
-        ids=[1, 2], means=[0.0] * 4, covariance=[1.0, 0.0, 1.0] * 2, chi2=1.0, dof=1
-    )
-    return watch
-
-
 def printed(watch: Watch, width: int) -> list[str]:
     out = StringIO()
     Console(file=out, width=width).print(live._view("thesis, seed 1", watch, width))
     return [line.rstrip() for line in out.getvalue().splitlines()]
-
-
-def test_without_truth_there_are_the_monitor_and_nis_alone():
-    lines = printed(told(2), 80)
-    assert any("NIS" in line for line in lines)
-    assert not any("NEES" in line or "95 %" in line for line in lines)
-    assert "joint cost per dof 1.07" in lines
-
-
-@pytest.mark.parametrize("peers", [False, True])
-def test_no_line_wraps_at_80_columns(peers):
-    watch = told(3)
-    world = status("world", "publishing", measurements=10.0, of=10.0, team_time_s=12345.0)
-    watch.statuses["world"] = msgspec.structs.replace(world, stamp_ns=12_345_000_000_000)
-    watch.statuses["central"].figures["covariance_scale"] = 12.34
-    watch.errors.landmarks.take(np.full(50, 1.0), 2)
-    assert watch.fused is not None
-    watch.fused = msgspec.structs.replace(watch.fused, stamp_ns=1_000_000_000)
-    if peers:
-        for k in (1, 2, 3):
-            watch.statuses[f"robot/r{k}"].figures["set_submaps"] = 123.0
-    wide, lines = printed(watch, 200), printed(watch, 80)
-    assert any("the world is 12,344 s ahead" in line for line in lines)
-    assert len(lines) == len(wide)
-    assert not any("…" in line for line in lines)
-    assert all("msg/s" in line for line in wide if "robot " in line)
 
 
 def test_while_a_team_starts_one_line_says_who_is_missing(monkeypatch):

@@ -163,15 +163,6 @@ def test_a_further_robot_changes_nothing_of_the_others(name):
         )
 
 
-def test_a_start_pose_is_exact_or_not_told_at_all():
-    robots = [RobotConfig(id="a"), RobotConfig(id="b")]
-    streams = simulate(SimulatedWorld(steps=5, unknown_starts=("b",)), robots, 1).streams
-    assert streams[0].start.covariance is None
-    assert np.array_equal(streams[0].start.pose, streams[0].truth[0])
-    assert streams[1].start is None
-    assert streams[1].kinds[0] == START
-
-
 @pytest.mark.parametrize(
     ("named", "unknown"),
     [((), ""), (("*",), "abc"), (("*", "!a"), "bc"), (("c", "a"), "ac"), (("*", "!a", "!b"), "c")],
@@ -180,6 +171,11 @@ def test_unknown_starts_are_named_or_all_or_all_but_some(named, unknown):
     robots = [RobotConfig(id=name) for name in "abc"]
     streams = simulate(SimulatedWorld(steps=5, unknown_starts=named), robots, 1).streams
     assert "".join(each.robot for each in streams if each.start is None) == unknown
+    for each in streams:
+        assert each.kinds[0] == START
+        if each.start is not None:
+            assert (each.start.pose == each.truth[0]).all()
+            assert each.start.covariance is None
 
 
 @settings(deadline=None, max_examples=50)
