@@ -147,8 +147,7 @@ def test_a_robots_clock_offset_orders_its_measurements_and_leaves_its_stamps(fol
 def test_a_simulated_set_comes_with_a_scenario_that_runs_its_team(name, tmp_path):
     done = run("simulate", name, "-o", tmp_path / "set")
     assert done.exit_code == 0
-    scenario = load(tmp_path / "set" / "scenario.toml")
-    source = load(name)
+    scenario, source = load(tmp_path / "set" / "scenario.toml"), load(name)
     assert f"teamslam launch {tmp_path / 'set' / 'scenario.toml'}" in done.stdout
     assert scenario.robots == source.robots
     assert (scenario.central, scenario.seed) == (source.central, source.seed)
@@ -288,23 +287,13 @@ def barcodes(*rows: str) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (
-            replaced("Odometry", 4, "4.0  0.1"),
-            "Robot1_Odometry.dat, line 7: 2 columns, 3 expected (time [s], forward velocity [m/s], "
-            "angular velocity [rad/s]): `4.0  0.1`",
-        ),
+        (replaced("Odometry", 4, "4.0  0.1"), "Robot1_Odometry.dat, line 7: 2 columns, 3 expected"),
         (
             replaced("Measurement", 0, "0.5 106 1,5 0.1"),
-            "Robot1_Measurement.dat, line 3: range [m]: '1,5' is not a number: `0.5 106 1,5 0.1`",
+            ".dat, line 3: range [m]: '1,5' is not a number",
         ),
-        (
-            replaced("Measurement", 2, "0.5 106 nan 0.1"),
-            "Robot1_Measurement.dat, line 5: range [m]: 'nan' is not finite",
-        ),
-        (
-            replaced("Odometry", 1, "1e300 0.0 0.1"),
-            "Robot1_Odometry.dat, line 4: time [s]: 1e300 is out of bounds",
-        ),
+        (replaced("Measurement", 2, "0.5 106 nan 0.1"), "line 5: range [m]: 'nan' is not finite"),
+        (replaced("Odometry", 1, "1e300 0.0 0.1"), "line 4: time [s]: 1e300 is out of bounds"),
         (barcodes("1 5", "2 5"), "Barcodes.dat: one barcode has two subjects"),
         (barcodes("1 5.5"), "Barcodes.dat: expected rows of two whole numbers"),
         (
@@ -314,10 +303,7 @@ def barcodes(*rows: str) -> Callable[[Path], None]:
             "Landmark_Groundtruth.dat: one landmark has two positions",
         ),
         (lambda folder: (folder / "Barcodes.dat").unlink(), "no Barcodes.dat in it; expected the"),
-        (
-            lambda folder: shutil.copytree(folder, folder / "second"),
-            "more than one data set in it (MRCLAM_Dataset0, second); give one of them",
-        ),
+        (lambda folder: shutil.copytree(folder, folder / "second"), "more than one data set in it"),
         (
             lambda folder: [path.unlink() for path in folder.glob("Robot1_*")],
             "the data set has no measurements of a robot r1; it has r2, r3",

@@ -3,9 +3,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from teamslam.sim.datasets.tables import DatasetError
+from teamslam.sim.world.streams import WorldStreams
 from tests.ros2 import messages as ros
-from tests.sim.importing.test_import import ODOMETRY, OPTICAL, TAGS, S, read, run
+from tests.sim.importing.test_import import ODOMETRY, OPTICAL, TAGS, S, imported, refusal
 
 TF = "tf2_msgs/msg/TFMessage"
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -34,9 +34,7 @@ def test_of_two_odometries_the_wheels_are_proposed_and_the_user_decides(tmp_path
     wheels, fused = f"{space}/wheel/odometry", f"{space}/odometry/filtered"
     messages = [*odometry(fused, "base_footprint", 2.0), *odometry(wheels, "base_footprint")]
     bag = ros.write_bag(tmp_path / "bag", [*messages, *seen(f"{space}/tags", "base_footprint")])
-    result = run(bag, "-o", tmp_path / "set")
-    assert isinstance(result.exception, DatasetError)
-    said = str(result.exception)
+    said = refusal(bag, "-o", tmp_path / "set")
     robot = space.strip("/") or "r1"
     assert f"{robot}: 2 topics may be its odometry, and one is used: {wheels} is proposed" in said
     assert f'odometry = "{wheels}"   # or "{fused}"' in said
@@ -46,8 +44,7 @@ def test_of_two_odometries_the_wheels_are_proposed_and_the_user_decides(tmp_path
     for topic, speed in ((wheels, 1.0), (fused, 2.0)):
         text = said[said.index("[robots.") : said.index("\nand type")]
         topics.write_text(text.replace(f'"{wheels}"   # or "{fused}"', f'"{topic}"'))
-        assert run(bag, "-o", tmp_path / f"{speed}", "--ros2", topics).exit_code == 0
-        (stream,) = read(tmp_path / f"{speed}").streams
+        (stream,) = imported(bag, "-o", tmp_path / f"{speed}", "--ros2", topics)[0].streams
         assert stream.intervals.increments[:, 0].tolist() == [speed, speed]
 
 
@@ -66,12 +63,11 @@ def test_each_camera_sees_from_its_own_place_and_frames_may_hang_below_either_ba
         *seen("/front/tags", "front_optical", ("1", ros.pose(-0.9, 0.0, 1.8))),
         *seen("/rear/tags", "rear_optical", ("2", ros.pose(1.0, 0.0, 2.7))),
     ]
-    result = run(ros.write_bag(tmp_path / "bag", messages), "-o", tmp_path / "set")
-    assert result.exit_code == 0, result.output
-    assert "r1: 2 sensors (front_optical, rear_optical) at several places" in result.output
-    mount = (tmp_path / "set" / "scenario.toml").read_text()
-    assert "mount" in mount
-    (stream,) = read(tmp_path / "set").streams
+    bag = ros.write_bag(tmp_path / "bag", messages)
+    world, said = imported(bag, "-o", tmp_path / "set")
+    assert "r1: 2 sensors (front_optical, rear_optical) at several places" in said
+    assert "mount" in (tmp_path / "set" / "scenario.toml").read_text()
+    (stream,) = world.streams
     points = stream.landmark_detections.points
     assert points is not None
     at = dict(zip(stream.landmark_detections.ids.tolist(), points, strict=True))
@@ -86,8 +82,7 @@ def test_robots_whose_frames_are_called_alike_keep_their_own_cameras(tmp_path):
         messages += static(f"/{robot}/tf_static", camera)
         messages += odometry(f"/{robot}/odom", "base_link")
         messages += seen(f"/{robot}/tags", "camera", ("1", ros.pose(2.0)))
-    bag = ros.write_bag(tmp_path / "bag", messages)
-    assert run(bag, "-o", tmp_path / "set").exit_code == 0
+    imported(ros.write_bag(tmp_path / "bag", messages), "-o", tmp_path / "set")
     text = (tmp_path / "set" / "scenario.toml").read_text()
     assert [f"{ahead}," in text for ahead in (0.2, 0.7)] == [True, True]
 
@@ -96,13 +91,13 @@ def test_a_detection_with_two_names_is_told_and_either_may_count(tmp_path):
     (tag,) = seen("/tags", "base_link", ("tag36h11:12", ros.pose(2.0)))
     tag[3].detections[0].id = "3"
     bag = ros.write_bag(tmp_path / "bag", [*odometry("/odom", "base_link"), tag])
-    result = run(bag, "-o", tmp_path / "a")
-    assert "has the id 3 and the class tag36h11:12: its id is taken" in result.output
+    first, said = imported(bag, "-o", tmp_path / "a")
+    assert "has the id 3 and the class tag36h11:12: its id is taken" in said
     (tmp_path / "topics.toml").write_text(
         '[robots.r1]\nodometry = "/odom"\ndetections = ["/tags"]\nnames = "class"\n'
     )
-    assert run(bag, "-o", tmp_path / "b", "--ros2", tmp_path / "topics.toml").exit_code == 0
-    found = [read(tmp_path / each).streams[0].landmark_detections.ids.tolist() for each in "ab"]
+    second, _ = imported(bag, "-o", tmp_path / "b", "--ros2", tmp_path / "topics.toml")
+    found = [each.streams[0].landmark_detections.ids.tolist() for each in (first, second)]
     assert found == [[3], [12]]
 
 
@@ -114,11 +109,14 @@ def test_what_was_stamped_before_the_clock_was_set_is_dropped_and_counted(tmp_pa
         messages.append((k * S, "/odom", ODOMETRY, ros.odometry(at, ros.pose(float(k)))))
     tags = ros.detections(year + 4 * S, "base_link", [("1", ros.pose(2.0))])
     bag = ros.write_bag(tmp_path / "bag", [*messages, (7 * S, "/tags", TAGS, tags)])
-    result = run(bag, "-o", tmp_path / "set")
-    assert result.exit_code == 0, result.output
-    assert "r1: 2 odometry rows dropped: by another clock than most rows: it jumps" in result.output
-    (stream,) = read(tmp_path / "set").streams
+    world, said = imported(bag, "-o", tmp_path / "set")
+    assert "r1: 2 odometry rows dropped: by another clock than most rows: it jumps" in said
+    (stream,) = world.streams
     assert stream.intervals.duration_ns.tolist() == [S, S, S]
+
+
+def ids_by_robot(world: WorldStreams) -> dict[str, list[int]]:
+    return {each.robot: each.landmark_detections.ids.tolist() for each in world.streams}
 
 
 def shared_tf(*, bases: tuple[str, str], odoms: tuple[str, str], linked: bool = True) -> list[Any]:
@@ -150,12 +148,11 @@ def test_in_a_shared_tf_each_robot_has_the_detections_of_its_own_camera(tmp_path
         for _, topic, kind, message in messages:
             if kind == ODOMETRY:
                 message.child_frame_id = f"{topic.split('/')[1]}/imu"
-    result = run(ros.write_bag(tmp_path / "bag", messages), "-o", tmp_path / "set")
-    assert result.exit_code == 0, result.output
-    ids = {s.robot: s.landmark_detections.ids.tolist() for s in read(tmp_path / "set").streams}
-    assert ids == {"ann": [1], "bob": [1, 2]}
-    assert "ann: 2 dropped: a detection in a frame of bob" in result.output
-    assert ("no transform" in result.output) == (by != "base")
+    bag = ros.write_bag(tmp_path / "bag", messages)
+    world, said = imported(bag, "-o", tmp_path / "set")
+    assert ids_by_robot(world) == {"ann": [1], "bob": [1, 2]}
+    assert "ann: 2 dropped: a detection in a frame of bob" in said
+    assert ("no transform" in said) == (by != "base")
 
 
 @pytest.mark.parametrize(
@@ -169,17 +166,14 @@ def test_detections_that_may_be_of_either_robot_are_refused_with_their_frames_an
     topics = tmp_path / "topics.toml"
     text = '[robots.{0}]\nodometry = "/{0}/odom"\ndetections = ["/tf"]\n'
     topics.write_text(text.format("ann") + text.format("bob"))
-    result = run(bag, "-o", tmp_path / "set", "--ros2", topics)
-    assert isinstance(result.exception, DatasetError)  # exit status 2
-    said = str(result.exception)
+    said = refusal(bag, "-o", tmp_path / "set", "--ros2", topics)
     assert "the frames ann/camera, bob/camera" in said
     assert '[robots.ann] frames = ["ann/camera", "bob/camera"]' in said
     assert not (tmp_path / "set").exists()
     listed = [text.format(name) + f'frames = ["{name}/camera"]\n' for name in ("ann", "bob")]
     topics.write_text("".join(listed))
-    assert run(bag, "-o", tmp_path / "set", "--ros2", topics).exit_code == 0
-    ids = {s.robot: s.landmark_detections.ids.tolist() for s in read(tmp_path / "set").streams}
-    assert ids == {"ann": [1], "bob": [1, 2]}
+    world, _ = imported(bag, "-o", tmp_path / "set", "--ros2", topics)
+    assert ids_by_robot(world) == {"ann": [1], "bob": [1, 2]}
 
 
 @pytest.mark.parametrize("linked", [True, False])
@@ -193,10 +187,9 @@ def test_tags_of_a_robot_that_is_not_imported_are_not_guessed_to_be_of_the_one_t
         '[robots.ann]\nodometry = "/ann/odom"\ndetections = ["/tf"]\nbase_frame = "ann/base_link"\n'
     )
     (tmp_path / "topics.toml").write_text(text)
-    result = run(bag, "-o", tmp_path / "set", "--ros2", tmp_path / "topics.toml")
-    assert isinstance(result.exception, DatasetError)
-    assert "bob/camera" in str(result.exception)
+    given = (bag, "-o", tmp_path / "set", "--ros2", tmp_path / "topics.toml")
+    assert "bob/camera" in refusal(*given)
     (tmp_path / "topics.toml").write_text(text + 'frames = ["ann/camera"]\n')
-    result = run(bag, "-o", tmp_path / "set", "--ros2", tmp_path / "topics.toml")
-    assert "ann: 2 dropped: a detection in a frame that `frames` does not list" in result.output
-    assert read(tmp_path / "set").streams[0].landmark_detections.ids.tolist() == [1]
+    world, said = imported(*given)
+    assert "ann: 2 dropped: a detection in a frame that `frames` does not list" in said
+    assert ids_by_robot(world) == {"ann": [1]}

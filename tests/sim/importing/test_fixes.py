@@ -3,14 +3,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import scenario_beside
 from teamslam.team.datum import Datum
 from teamslam.team.geodesy import geodetic_from_local, local_from_geodetic
 from tests.ros2 import messages as ros
 from tests.sim.importing.test_bag_topics import LEVEL, static
-from tests.sim.importing.test_import import S, drive, read, run
+from tests.sim.importing.test_import import S, drive, imported, read, refusal
 
 FIX = "sensor_msgs/msg/NavSatFix"
 DATUM = Datum(48.745, 9.105)
@@ -58,17 +57,16 @@ def test_a_bags_fixes_become_a_table_in_the_plane_of_the_first_or_of_a_stated_da
     topics = topics_with_datum(tmp_path / "topics.toml")
     moved = {}
     for name, more in (("first", ()), ("stated", ("--ros2", topics))):
-        result = run(bag, "-o", tmp_path / name, *more)
-        assert result.exit_code == 0, result.output
-        assert "r1: 1 dropped: a message of a receiver without a fix" in result.output
-        (stream,) = read(tmp_path / name).streams
+        world, said = imported(bag, "-o", tmp_path / name, *more)
+        assert "r1: 1 dropped: a message of a receiver without a fix" in said
+        (stream,) = world.streams
         assert stream.fixes_ns.tolist() == [S, 2 * S]
         np.testing.assert_array_equal(stream.fixes[1, 2:], [0.04, 0.01, 0.09])
         assert np.isnan(stream.fixes[0, 2:]).all()
         moved[name] = stream.fixes[:, :2]
         datum = load(scenario_beside(tmp_path / name)).central.datum
         assert datum is not None
-        assert f"fixes are east and north of the datum {datum.latitude_deg}," in result.output
+        assert f"fixes are east and north of the datum {datum.latitude_deg}," in said
     np.testing.assert_allclose(moved["stated"], [[10.0, 20.0], [12.0, 21.0]], atol=1e-5)
     assert np.abs(moved["first"][0]).max() < 0.06  # the first fix, rounded to 10⁻⁶ degrees
     np.testing.assert_allclose(np.diff(moved["first"], axis=0), [[2.0, 1.0]], atol=1e-3)
@@ -76,12 +74,10 @@ def test_a_bags_fixes_become_a_table_in_the_plane_of_the_first_or_of_a_stated_da
 
 def test_of_two_receivers_the_user_decides_and_a_filtered_one_is_left_out(tmp_path):
     two = ros.write_bag(tmp_path / "two", [*drive(), *fixes("/left/fix"), *fixes("/right/fix")])
-    refused = run(two, "-o", tmp_path / "set")
-    assert isinstance(refused.exception, DatasetError)
-    assert "2 topics may be its fixes: /left/fix, /right/fix" in str(refused.exception)
+    refused = refusal(two, "-o", tmp_path / "set")
+    assert "2 topics may be its fixes: /left/fix, /right/fix" in refused
     both = ros.write_bag(tmp_path / "b", [*drive(), *fixes(), *fixes("/gps/filtered")])
-    assert run(both, "-o", tmp_path / "set").exit_code == 0
-    assert len(read(tmp_path / "set").streams[0].fixes) == 2
+    assert len(imported(both, "-o", tmp_path / "set")[0].streams[0].fixes) == 2
 
 
 def test_fixes_of_an_added_robot_are_in_the_plane_of_the_data_set(tmp_path):
@@ -89,8 +85,7 @@ def test_fixes_of_an_added_robot_are_in_the_plane_of_the_data_set(tmp_path):
     for robot, east_m in (("ann", 10.0), ("bob", 40.0)):
         made = [*antenna, *drive(), *fixes(frame="gps", east_m=east_m)]
         bag = ros.write_bag(tmp_path / robot, made)
-        result = run(bag, "-o", tmp_path / "set", "--robot", robot)
-        assert result.exit_code == 0, result.output
+        imported(bag, "-o", tmp_path / "set", "--robot", robot)
     one, other = (stream.fixes[:, :2] for stream in read(tmp_path / "set").streams)
     np.testing.assert_allclose(other - one, [[30.0, 0.0], [30.0, 0.0]], atol=1e-3)
     robots = load(scenario_beside(tmp_path / "set")).robots

@@ -79,23 +79,14 @@ UTIAS = 'world = { kind = "utias" }\n'
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (
-            SMALL + "[defaults.front_end]\npartcles = 5",
-            "unknown field `partcles` at defaults.front_end; known: particles, proposal, ",
-        ),
-        (
-            SMALL + '[central]\nfusion = "kalman"',
-            "`fusion` is set once for the whole team, at the top of the file",
-        ),
+        (SMALL + "[defaults.front_end]\npartcles = 5", "`partcles` at defaults.front_end; known"),
+        (SMALL + '[central]\nfusion = "kalman"', "`fusion` is set once for the whole team"),
         (
             SMALL + "[[robots]]\n[[robots]]\nmotion = { turn = { per_y = 1 } }",
-            "unknown field `per_y` at robots[1].motion.turn",
+            "at robots[1].motion",
         ),
         (SMALL + "[defaults.sensor]\nrange_sigma = 'a'", "expected float, got str at defaults.s"),
-        (
-            SMALL + "[defaults.sensor]\nrange_sigma = -0.5",
-            "expected float > 0.0 at defaults.sensor.range_sigma: -0.5",
-        ),
+        (SMALL + "[defaults.sensor]\nrange_sigma = -0.5", "> 0.0 at defaults.sensor.range_sigma"),
         (SMALL + "[defaults.sensor]\nrange_sigma = nan", "expected a finite number, got nan at d"),
         (SMALL + "x = = 2", "line 6, column 5"),
         ("robot_count = 1001\n" + SMALL, "1001 robots: a team has 1 to 1000"),
@@ -105,52 +96,24 @@ UTIAS = 'world = { kind = "utias" }\n'
         ("robots = [3]\n" + SMALL, "expected a table, got int at robots[0]"),
         ("robot_count = 2\n" + SMALL + "[[robots]]", "robot_count and [[robots]] exclude each"),
         (SMALL + "[[robots]]\nid = 'a'\n[[robots]]\nid = 'a'", "two robots have the id a"),
-        (
-            SMALL + "[[robots]]\nid = 'A 1'",
-            "expected a small letter, then small letters, digits and _",
-        ),
+        (SMALL + "[[robots]]\nid = 'A 1'", "expected a small letter, then small letters, digits"),
         ("name = 'a b'\nrobot_count = 1\n" + SMALL, "expected letters, digits, _, . and -"),
         (SMALL + "[defaults]\nid = 'a'", "`id` at defaults would be every robot's"),
-        (
-            "seed = 1",
-            'no kind of world: put base = "recorded" (or another built-in scenario: dlr, ',
-        ),
+        ("seed = 1", 'no kind of world: put base = "recorded" (or another built-in scenario'),
         ("world = { kind = 'lve' }", "got 'lve' at world.kind; did you mean `live`?"),
-        (
-            "base = 'recorded'\n[world]\nadmit = true",
-            '`admit` is no field of a world of kind "folder", which this file or its base has, but '
-            'of kind = "live" at world; known: path',
-        ),
+        ("base = 'recorded'\n[world]\nadmit = true", '"folder", which this file or its base has'),
         (SMALL + "landmarks = [[1, 2]]", "landmarks and landmark_count exclude each other"),
         (SMALL + "paths = [[[1, 2]]]", "path 0 has no length: give two way-points or more"),
-        (
-            "robot_count = 1\n" + SMALL + "unknown_starts = ['r2']",
-            "world.unknown_starts names r2, no such robot",
-        ),
-        (
-            "robot_count = 3\n" + SMALL + "size_m = 1.9",
-            "way_point_tolerance_m is 1 in a place 1.9 m wide",
-        ),
-        (
-            SMALL + "visible_from_m = 0.5\nvisible_to_m = 0.2",
-            "visible_to_m = 0.2 is not above visible_from_m = 0.5: no landmark would be seen",
-        ),
-        (
-            SMALL + "[defaults.sensor]\nmin_range = 3\nmax_range = 2",
-            "max_range = 2 is not above min_range = 3",
-        ),
+        ("robot_count = 1\n" + SMALL + "unknown_starts = ['r2']", "unknown_starts names r2"),
+        ("robot_count = 3\n" + SMALL + "size_m = 1.9", "tolerance_m is 1 in a place 1.9 m wide"),
+        (SMALL + "visible_from_m = 0.5\nvisible_to_m = 0.2", "is not above visible_from_m = 0.5"),
+        (SMALL + "[defaults.sensor]\nmin_range = 3\nmax_range = 2", "2 is not above min_range = 3"),
         ("world = { kind = 'simulated' }", "missing required field steps"),
-        (
-            SMALL + "[defaults.motion]\nkind = 'differential-drive'",
-            "differential-drive needs wheel_base, the distance of its wheels in metres at def",
-        ),
+        (SMALL + "[defaults.motion]\nkind = 'differential-drive'", "needs wheel_base"),
         (SMALL + "[defaults.motion]\nleft_wheel = 0.1", "noises of differential-drive, not of vel"),
         (UTIAS + "[[robots]]\nid = 'alice'", "the robot alice: in a UTIAS world robots are r1, r2"),
         ("world = { kind = 'utias', start_sigma_m = 1 }", "are both 0 or both above 0"),
-        (
-            "base = 'thesys'",
-            "expected a built-in scenario, got 'thesys' at base; known: dlr, downs-10, ",
-        ),
+        ("base = 'thesys'", "expected a built-in scenario, got 'thesys' at base; known: dlr, "),
         ("base = 'my.toml'", "a file can not be a base: copy what you need of it"),
         ("estimator = 'hybrid-thesis'\n" + SMALL, "valid: hybrid + join, hybrid + kalman, "),
     ],
