@@ -2,6 +2,7 @@ import sys
 from dataclasses import replace
 
 import gtsam
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,12 +12,12 @@ from scipy.stats import chi2
 from teamslam.sim.recorded.chains import BatchReferenceError, Chain, Scan, chains_of
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.studies.batch_reference.graph import FLOOR_SIGMAS, factor_graph, values_of
-from teamslam.sim.studies.batch_reference.reference import BatchReference, batch_map
+from teamslam.sim.studies.batch_reference.reference import batch_map
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig
 from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.se2 import compose, exponential
-from tests.scenarios import with_world
-from tests.sim.logs import counted_twice, joined_log, scenario, streams, world_log
+from tests.scenarios import with_robots, with_world
+from tests.sim.logs import counted_twice, joined_log, scenario, streams, without_starts, world_log
 
 small = st.floats(-0.3, 0.3)
 
@@ -60,21 +61,45 @@ def test_a_chain_has_the_measurements_in_order_each_once():
     assert len(chain.increments) == len(chain.scans) == 20
 
 
-def nees_of(of: Scenario, *, twice: bool) -> BatchReference:
-    log = joined_log(with_world(of, steps=8), 0.02)
-    return batch_map(counted_twice(log) if twice else log)
+def lasting(of: Scenario) -> Scenario:
+    lasts = {f"{x}_white": 0.1 for x in ("range", "bearing")}
+    lasts |= {f"{x}_correlation_s": 10.0 for x in ("range", "bearing")}
+    return with_robots(of, sensor=msgspec.structs.replace(of.robots[0].sensor, **lasts))
 
 
-@pytest.mark.parametrize("twice", [False, True], ids=["each measurement once", "mutant: twice"])
-def test_the_map_is_consistent_and_a_measurement_used_twice_is_found(twice):
-    """The mutant needs fewer runs."""
-    seeds = range(100, 130 if twice else 180)
-    runs = [nees_of(scenario(seed), twice=twice) for seed in seeds]
-    errors = [run.errors for run in runs if run.errors is not None]
+@pytest.mark.parametrize(
+    ("case", "kind", "seeds"),
+    [("once", "white", 80), ("twice", "white", 30), ("lasting", "profile", 30),
+     ("lasting", "white", 30)],
+)  # fmt: skip
+def test_the_map_is_consistent_unless_measurements_count_twice_or_lasting_errors_as_white(
+    case, kind, seeds
+):
+    """Mutants need fewer runs."""
+    errors = []
+    for seed in range(100, 100 + seeds):
+        of = lasting(scenario(seed)) if case == "lasting" else scenario(seed)
+        log = joined_log(with_world(of, steps=8), 0.02)
+        found = batch_map(counted_twice(log) if case == "twice" else log, kind).errors
+        errors += [] if found is None else [found]
     dof = sum(2 * e.count for e in errors)
     total = sum(e.nees_per_dof * 2 * e.count for e in errors)
     inside = chi2.ppf(0.0005, dof) <= total <= chi2.ppf(0.9995, dof)
-    assert inside == (not twice), f"NEES/dof {total / dof:.3f} over {dof}"
+    is_right = case == "once" or (case, kind) == ("lasting", "profile")
+    assert inside == is_right, f"NEES/dof {total / dof:.3f} over {dof}"
+
+
+def test_in_an_arbitrary_frame_the_figures_have_no_unaligned_error():
+    of = scenario()
+    known, unknown = (batch_map(joined_log(x, 0.02)).to_json() for x in (of, without_starts(of)))
+    for name in ("landmark_rmse_m", "map_nees_per_dof", "map_nees_in_band", "coverage"):
+        assert known[name] is not None
+        assert known["team"][name] is not None
+        assert unknown[name] is unknown["team"][name] is None
+    assert known["robots"]["r1"]["position_rmse_m"] is not None
+    assert unknown["robots"]["r1"]["position_rmse_m"] is None
+    assert unknown["landmark_rmse_aligned_m"] is not None
+    assert unknown["shape_nees_per_landmark"] is not None
 
 
 def test_without_gtsam_the_error_says_how_to_install_it(monkeypatch):

@@ -4,11 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
-from teamslam.team import core
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.gaussian import NotDeterminedError
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
@@ -22,7 +19,7 @@ from teamslam.team.estimation.map_joining.marginals import (
 )
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
-from tests.estimation.submap_world import local_truth, team, wrap
+from tests.estimation.submap_world import team
 
 EXACTLY = JoinSettings(step_tolerance=1e-11)
 
@@ -114,36 +111,6 @@ def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
 
 
 # --- the mathematics of one factor ---
-
-
-@settings(deadline=None, max_examples=50)
-@given(st.integers(0, 2**32), st.integers(0, 4))
-def test_the_factor_is_what_central_differences_of_its_residual_say(seed, count):
-    rng = np.random.default_rng(seed)
-    state = rng.normal(0.0, 3.0, 6 + 2 * count)
-    mean = rng.normal(0.0, 3.0, 3 + 2 * count)
-    root = rng.normal(size=(len(mean), len(mean))) + 3.0 * np.eye(len(mean))
-    information = root @ root.T
-
-    def residual(x):
-        r = local_truth(x[:3], x[3:6], x[6:].reshape(-1, 2)) - mean
-        r[2] = wrap(r[2])
-        return r
-
-    h = 1e-6
-    columns = [(residual(state + d) - residual(state - d)) for d in h * np.eye(len(state))]
-    jacobian = np.array(columns).T / (2 * h)
-    jacobian[2] = 0.0
-    jacobian[2, 2], jacobian[2, 5] = -1.0, 1.0
-    at = np.array([0, 3, *(6 + 2 * k for k in range(count))])
-    no_bias = np.zeros((0, len(mean))), np.zeros(0, np.int64)
-    factor = core.SubmapFactor(mean, information, np.zeros((count, 3)), *no_bias)
-    hessian, gradient, chi2 = factor.normal(state, at)
-    r = residual(state)
-    tolerance = {"rtol": 1e-6, "atol": 1e-6 * np.abs(information).max() * 100}
-    assert chi2 == pytest.approx(r @ information @ r)
-    np.testing.assert_allclose(gradient, jacobian.T @ information @ r, **tolerance)
-    np.testing.assert_allclose(hessian, jacobian.T @ information @ jacobian, **tolerance)
 
 
 def test_the_kernels_gradient_is_the_slope_of_the_cost_that_is_minimised():

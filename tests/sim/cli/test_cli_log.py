@@ -1,5 +1,4 @@
 import msgspec
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -11,11 +10,9 @@ from teamslam.sim.datasets.utias import write_utias
 from teamslam.team.recording.check import NO_FINAL
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.messages import Increment
-from tests import commands
+from tests import build, commands
 from tests.sim.logs import scenario, streams, world_log
 
 
@@ -90,33 +87,30 @@ def test_the_exported_data_set_is_the_one_that_the_world_would_write(log, tmp_pa
         assert (tmp_path / "log" / name).read_bytes() == (tmp_path / "world" / name).read_bytes()
 
 
-def test_a_utias_set_of_one_robot_of_a_team_is_refused_with_the_remedy(log, tmp_path):
-    alone = tmp_path / "r1.mcap"
+def test_a_log_that_the_format_of_utias_does_not_hold_is_refused_with_the_remedy(tmp_path):
     own = [s for s in published() if s.key.startswith("source/r1")]
-    with Recorder(alone, "small", {}) as recorder:
-        recorder.write(own)
-    status, _, err = run("export", alone, "--format", "utias", "-o", tmp_path / "out")
-    assert status == 2
-    assert "r1.mcap: it has sightings of r2 but not their measurements; `teamslam log merge`" in err
-    with Recorder(tmp_path / "gap.mcap", "small", {}) as recorder:
-        recorder.write([s for s in own if s.counter != 3 and "sight" not in s.key])
-    status, _, err = run("export", tmp_path / "gap.mcap", "--format", "utias", "-o", tmp_path / "o")
-    assert status == 2
-    assert "gap.mcap: r1: odometry intervals are not contiguous in time: one ends" in err
-    assert "the format needs measurements without gaps" in err
-    moving = tmp_path / "moving.mcap"
-    step = from_floats(np.array([1.0, 0.0, 0.1]))
-    with Recorder(moving, "small", {}) as recorder:
-        start, first = (next(s for s in own if opened(s)[2].number == k) for k in (0, 1))
-        name = {"stamp_ns": first.stamp_ns, "robot": "r1", "incarnation": 1, "number": 1}
-        told = Increment(**name, duration_ns=10**9, increment=step)
-        recorder.write(
-            [start, msgspec.structs.replace(first, key="source/r1/odometry", payload=encoded(told))]
-        )
-    status, _, err = run("export", moving, "--format", "utias", "-o", tmp_path / "m")
-    assert status == 2
-    assert "moving.mcap: it has odometry as motions, which the format does not have" in err
-    assert f"`teamslam import {moving} -o FOLDER`" in err
+    start, first = (next(s for s in own if opened(s)[2].number == k) for k in (0, 1))
+    step = build.increment(stamp_ns=first.stamp_ns, number=1, increment=[1.0, 0.0, 0.1])
+    moved = {"key": "source/r1/odometry", "payload": encoded(step)}
+    for samples, *words in (
+        (own, "it has sightings of r2 but not their measurements; `teamslam log merge`"),
+        (
+            [s for s in own if s.counter != 3 and "sight" not in s.key],
+            "r1: odometry intervals are not contiguous in time: one ends",
+            "the format needs measurements without gaps",
+        ),
+        (
+            [start, msgspec.structs.replace(first, **moved)],
+            "it has odometry as motions, which the format does not have",
+            "-o FOLDER`",
+        ),
+    ):
+        log = tmp_path / f"{len(samples)}.mcap"
+        with Recorder(log, "small", {}) as recorder:
+            recorder.write(samples)
+        status, _, err = run("export", log, "--format", "utias", "-o", tmp_path / "out")
+        assert status == 2
+        assert [each for each in (f"{log.name}: ", *words) if each not in err] == []
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,6 @@ def told(monkeypatch, tmp_path, capfd):
             ["hybrid-thesis can not feed the rule join", "valid:", "kalman-per-axis"],
         ),
         (["launch", "thesis", "--fusion", "mean"], ["'mean' at fusion", "covariance-intersection"]),
-        (["launch", "thesis", "--seed", "-1"], ["expected int >= 0 at seed"]),
         (["launch", "thesis", "--speed", "banana"], ["--speed banana", "positive number, or max"]),
         (["launch", "thesis", "--speed", "-1"], ["--speed -1", "positive number, or max"]),
         (["launch", "--dataset", "nowhere.zip"], ["nowhere.zip: no such file or folder"]),
@@ -78,10 +77,10 @@ def test_wrong_use_is_told_with_what_to_do(arguments, parts, told):
 @pytest.mark.parametrize(
     ("text", "arguments", "said"),
     [
-        ("robotcount = 2", ["launch", "mine"], "mine: unknown field `robotcount`; known: name"),
+        ("robotcount = 2", ["launch", "mine"], "mine: unknown field `robotcount`"),
         ("steps =", ["launch", "mine"], "mine: not valid TOML"),
         ("", ["replay", "mine"], "mine: empty file"),
-        ("no log", ["repair", "mine", "--output", "out"], "mine: not an MCAP file"),
+        ("no log", ["repair", "mine", "--output", "out"], "mine: no MCAP file"),
     ],
 )
 def test_a_mistake_in_a_file_is_told_with_its_name(text, arguments, said, told):

@@ -262,8 +262,8 @@ def test_what_is_dropped_is_counted_with_its_reason_and_line(tmp_path):
         ("start", "x_m,y_m,theta_rad\n0,0,90\n", "90 is more than a whole turn; it must be in rad"),
         (
             "observations",
-            "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,1,,\n",
-            "line 2, column c_xy",
+            "t_s,landmark,x_m,y_m,c_xx,c_xy,c_yy\n1,1,1,1,1,0,1\n2,1,1,1,1,,\n",
+            "line 3, column c_xy: no number here",
         ),
         ("observations", SEEN + '3,7,"2,5",0\n', "'2,5' is not a number; use a decimal point"),
         ("observations", SEEN + "3,door,1,0\n", "give each landmark a number"),

@@ -1,12 +1,11 @@
 import msgspec
 import numpy as np
 
-from teamslam.sim.radio.bus import behind_radio, plan_of, reach_in, reach_of
+from teamslam.sim.radio.bus import behind_radio, plan_of, reach_of
 from teamslam.sim.world.config import Radio, RadioWindow
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
-from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.support import submap
 from tests.teams import stream
@@ -30,18 +29,6 @@ def test_windows_open_for_whom_they_name():
     first = reach.first_ns // SECOND
     assert at == [first + 3, first + 4, first + 5]
     assert not any(reach.between("r1", "r2", t * SECOND) for t in range(1, 19))
-
-
-def test_the_worlds_plan_says_what_the_world_knows():
-    three = (*PAIR, stream("r3", 20, y=5.0))
-    reach = reach_of(Radio(comm_range_m=26.0), three)
-    again = reach_in(encoded(plan_of(reach)))
-    assert (again.robots, again.first_ns, again.ends_ns) == (
-        reach.robots,
-        reach.first_ns,
-        reach.ends_ns,
-    )
-    assert np.array_equal(again.pairs, reach.pairs)
 
 
 def test_what_is_out_of_reach_does_not_come_in_and_nobody_hears_its_question():

@@ -137,6 +137,8 @@ def test_what_is_no_scenario_is_refused(tmp_path):
     for text in ("{", "[]", "{}"):
         with pytest.raises(ScenarioError):
             loads(text)
+    with pytest.raises(ScenarioError, match="expected int >= 0 at seed"):
+        with_options(load("thesis"), seed=-1)
 
 
 def test_a_simulated_robot_whose_odometry_has_no_noise_is_doubted(tmp_path):
