@@ -1,8 +1,16 @@
+import json
+import os
+import platform
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
+from tests.across import CLASSES
+from tests.estimation import arithmetic
 
 SHAPES = [
     ((3,), (3,)),
@@ -116,3 +124,17 @@ def test_landmarks_are_sound_each_alone(block, is_sound):
     covariance[5:, 5:], covariance[3, 6] = np.eye(2), np.nan
     whole = core.WholeMap(np.array([3, 7], np.uint32), np.zeros(7), covariance)
     assert not whole.has_sound_landmarks
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the class is one of x86_64")
+def test_a_processor_without_avx_computes_the_same_bits():
+    finished = subprocess.run(
+        [sys.executable, "-m", "tests.estimation.arithmetic"],
+        env={**os.environ, **CLASSES["without AVX"]},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    level, found = json.loads(finished.stdout)
+    assert level == "x86-64-v2"
+    assert found == arithmetic.digests()

@@ -1,3 +1,4 @@
+import gc
 from functools import cache
 from itertools import pairwise
 
@@ -8,9 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.team.config import FrontEnd
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
+from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.pairs import PAIRS
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot import node as robot_node
+from teamslam.team.robot.maps import CONDENSED
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.robot.node import robot_node as node_for
 from teamslam.team.wire import channels as ch
@@ -393,3 +397,40 @@ def test_a_window_that_is_computed_again_goes_on_to_the_same_messages(seed):
         last = begin + 100 >= len(measurements)
         again += driven(node, measurements[begin : begin + 100], end=last)
     assert [encoded(each.message) for each in out] == [encoded(each.message) for each in again]
+
+
+def test_a_stored_submap_has_the_bits_of_the_window_that_closed():
+    windows: list[ClosedWindow] = []
+    node = RobotNode(config(), on_window=windows.append)
+    driven(node, published(stream("r1", 30)))
+    stored = node.mapper.submaps
+    assert len(stored) == len(windows) > 5
+    for local, window in zip(stored, windows, strict=True):
+        assert local.ids.tobytes() == window.local.ids.tobytes()
+        assert local.mean.tobytes() == window.local.mean.tobytes()
+        assert local.covariance.tobytes() == window.local.covariance.tobytes()
+    assert [x.mean.tobytes() for x in stored[2:]] == [w.local.mean.tobytes() for w in windows[2:]]
+
+
+def local_maps() -> int:
+    gc.collect()
+    return sum(isinstance(each, LocalMap) for each in gc.get_objects())
+
+
+def test_of_closed_windows_a_robot_keeps_nothing_but_the_messages():
+    """The number of local maps is that of the submaps that a prior lacks, at most 2 · CONDENSED."""
+    before = local_maps()
+    node = RobotNode(config())
+    out = driven(node, published(stream("r1", 60)), end=False)
+    assert len(of(out, ch.SUBMAP)) == 20
+    del out
+    assert local_maps() - before <= 1
+    prior = build.prior(
+        sequence=16,
+        digest=bytes(8),
+        mean=np.zeros(3).tobytes(),
+        covariance=np.eye(3)[np.triu_indices(3)].tobytes(),
+    )
+    node.handle(prior)
+    driven(node, published(stream("r1", 70))[len(published(stream("r1", 60))) :], end=False)
+    assert 0 < local_maps() - before <= 2 * CONDENSED

@@ -7,7 +7,7 @@ import asyncio
 import socket
 from pathlib import Path
 
-from tests.sim.cli.test_wrong_use import message_in
+from tests.sim.cli.test_help import message_in
 from tests.support import nobody_listens
 from tests.system.processes import Process, Processes
 

@@ -6,19 +6,24 @@ import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central.desk.evaluation.errors import Path, on_circle
+from teamslam.central.desk.evaluation.errors import TRUTH_GAP_NS, Path, on_circle
 from teamslam.sim.calibration.calibrate import Calibration, calibrate_models
-from teamslam.sim.calibration.data import Reference
+from teamslam.sim.calibration.claims import landmark_factor, mount_note, odometry_factor
+from teamslam.sim.calibration.data import Reference, references, true_paths
 from teamslam.sim.calibration.figures import CalibrationError, Figure, jackknife, with_figures
 from teamslam.sim.calibration.join import join_team
 from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
 from teamslam.sim.calibration.motion import fit_motion
+from teamslam.sim.calibration.own import marker_spread, own_constants
 from teamslam.sim.calibration.scenario import scenario_text
 from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
 from teamslam.sim.calibration.sensor import fit_sensor
 from teamslam.sim.datasets.utias import write_utias
 from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import Intervals, grouped
+from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.commands import output_of, run
 from tests.sim.logs import scenario, streams
 
@@ -251,3 +256,151 @@ def test_an_output_in_a_folder_that_can_not_be_made_is_refused_before_the_data_i
         result = run("calibrate", tmp_path / "none", "-o", output)
         assert result.exit_code != 0
         assert ("reading" in result.output) == reads
+
+
+PLACES = {i: (1.0 + 0.4 * i) * np.array([np.cos(a), np.sin(a)])
+          for i, a in enumerate(np.linspace(-0.6, 0.6, 8), 1)}  # fmt: skip
+CAMERAS = {"r1": (1.02, 0.05, 0.0), "r2": (1.05, 0.0, 0.01), "r3": (0.99, 0.1, -0.04)}
+"""range_scale, range_offset [m], optical_axis [rad]."""
+BENT = -0.05  # cubic error of the bearings
+
+
+def looking(
+    robot: str,
+    world: int,
+    camera: tuple[float, float, float],
+    *,
+    depth: bool = True,
+    marker: float = 0.0,
+) -> Reference:
+    rng = np.random.default_rng([int(robot[1:]), world])
+    scale, offset, axis = camera
+    ids = np.repeat(np.array(list(PLACES), np.uint32), 300)
+    places = np.repeat(np.array(list(PLACES.values())), 300, axis=0)
+    bearings = np.arctan2(places[:, 1], places[:, 0])
+    distances = np.hypot(*places.T) * (1.0 + 0.01 * rng.standard_normal(len(ids)))
+    distances *= 1.0 + marker * np.random.default_rng(world).standard_normal(len(PLACES))[ids - 1]
+    raw = bearings + 0.01
+    for _ in range(20):
+        raw = bearings + 0.01 + BENT * raw**3
+    along = np.cos(raw - axis) if depth else 1.0
+    read = on_circle(raw + 0.002 * rng.standard_normal(len(ids)))
+    stamps = rng.permutation(len(ids)).astype(np.int64) * 100_000_000
+    order = np.argsort(stamps)
+    seen = grouped(
+        stamps[order], ids[order], (scale * distances * along + offset)[order], read[order]
+    )
+    last = int(stamps.max())
+    intervals = Intervals(np.array([last]), np.array([last]), np.zeros(1), np.zeros(1))
+    path = Path(np.array([0, last]), np.zeros((2, 3)))
+    label = f"{world} {robot}"
+    return reference(
+        label, intervals=intervals, seen=seen, path=path, gap_ns=last, landmarks=PLACES
+    )
+
+
+def team(cameras: dict[str, tuple[float, float, float]], *, depth: bool = True) -> list[Reference]:
+    return [looking(r, w, camera, depth=depth) for w in (1, 2) for r, camera in cameras.items()]
+
+
+def test_each_cameras_own_constants_come_out_where_they_differ():
+    own = own_constants(team(CAMERAS), depth=True)
+    assert list(own.robots) == list(CAMERAS)
+    for robot, (scale, offset, axis) in CAMERAS.items():
+        found = {figure.name: figure for figure in own.robots[robot]}
+        assert found["range_scale"].value == pytest.approx(scale, abs=0.003)
+        assert found["range_offset"].value == pytest.approx(offset, abs=0.006)
+        assert found["bearing_lens.cubic"].value == pytest.approx(BENT, abs=0.01)
+        assert found["optical_axis"].value == pytest.approx(axis, abs=0.003)
+    assert {figure.name for figure in own.strays} == {
+        "bias_sigma.bearing", "bias_sigma.range_offset", "bias_sigma.range_scale",
+        "common_bias_sigma.range_scale",
+    }  # fmt: skip
+    assert max(f.value for f in own.strays if f.name.endswith("range_scale")) < 0.003
+
+
+def test_a_camera_that_was_changed_between_worlds_does_not_widen_what_all_have():
+    data = team(CAMERAS | {"r4": CAMERAS["r1"]})
+    before = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}
+    data[-1] = replace(looking("r4", 2, (1.08, 0.0, 0.0)), name="2 r4")
+    after = {figure.name: figure.value for figure in own_constants(data, depth=True).strays}
+    assert after["bias_sigma.range_scale"] < 3.0 * before["bias_sigma.range_scale"] + 1e-3
+
+
+def test_how_far_all_range_scales_stray_together_is_learnt_from_world_to_world():
+    read = [
+        looking(robot, world, (scale + by, *rest))
+        for world, by in ((1, 0.02), (2, -0.02))
+        for robot, (scale, *rest) in CAMERAS.items()
+    ]
+    found = {figure.name: figure.value for figure in own_constants(read, depth=True).strays}
+    own = found["bias_sigma.range_scale"]
+    together = np.sqrt((2.0 * own**2 + 2.0 * 0.02**2) / 3.0 * 1.5)
+    assert found["common_bias_sigma.range_scale"] == pytest.approx(together, rel=0.1)
+
+
+def test_how_far_markers_differ_comes_out_and_is_none_where_they_are_alike():
+    """Six worlds of eight landmarks; the fitted constants absorb a part of the spread."""
+    marked = [
+        looking(r, world, camera, marker=0.02)
+        for world in range(1, 7)
+        for r, camera in CAMERAS.items()
+    ]
+    found = marker_spread(marked, depth=True)
+    assert found.name == "common_bias_sigma.marker"
+    assert found.value == pytest.approx(0.02, abs=3.0 * found.sigma)
+    assert 0.0005 < found.sigma < 0.004
+    assert marker_spread(team(CAMERAS), depth=True) is None
+    assert marker_spread(marked[:1], depth=True) is None
+
+
+MOUNT = (1.2, -0.4, 0.3)
+ROBOTS = [
+    RobotConfig(
+        f"r{i}",
+        motion=MotionModel(
+            forward=MotionNoise(0.02), turn=MotionNoise(0.01), lateral=MotionNoise(0.02)
+        ),
+        sensor=Sensor(range_sigma=0.1, bearing_sigma=0.02, mount=MOUNT),
+    )
+    for i in range(6)
+]
+WORLD = SimulatedWorld(
+    steps=300, size_m=30.0, landmark_count=12, visible_from_m=1.0, visible_to_m=12.0,
+    odometry="increments", odometry_claims=True, odometry_correlation=0.5,
+    landmark_claims=(0.5, 2.0), claims_factor=4.0,
+)  # fmt: skip
+
+
+def seen(assumed: tuple[float, float, float] = MOUNT, **changes: object) -> list[Reference]:
+    world = simulate(msgspec.structs.replace(WORLD, **changes), ROBOTS, 3)
+    assert world.landmarks is not None
+    places = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
+    sensor = msgspec.structs.replace(ROBOTS[0].sensor, mount=assumed)
+    models = msgspec.structs.replace(ROBOTS[0], sensor=sensor)
+    paths = true_paths(world.streams)
+    return references(world, paths, places, TRUTH_GAP_NS, "set", frozenset(), models)
+
+
+@pytest.mark.parametrize("told", ["ranges", "points"])
+def test_the_factors_of_what_is_claimed_are_learnt(told):
+    data = seen(landmark_form=told)
+    assert odometry_factor(data)["covariance_factor"] == pytest.approx(4.0, rel=0.25)
+    found = landmark_factor(data, ROBOTS[0].sensor)["covariance_factor"]
+    assert found == pytest.approx(4.0, rel=0.1)
+
+
+def test_a_mount_that_is_not_the_scenarios_is_told_and_where_it_is():
+    assert mount_note(seen(), ROBOTS[0].sensor) == ()
+    wrong = msgspec.structs.replace(ROBOTS[0].sensor, mount=(0.0, 0.0, 0.3))
+    (note,) = mount_note(seen(wrong.mount), wrong)
+    told = note.partition("sensor.mount = [")[2].partition("]")[0]
+    np.testing.assert_allclose([float(x) for x in told.split(",")], MOUNT, atol=0.03)
+
+
+def test_a_place_that_the_view_does_not_determine_is_refused_by_name():
+    data = seen()
+    for k, each in enumerate(data):
+        object.__setattr__(each, "seen", each.seen.only(0, 3 + k))
+    (note,) = mount_note(data, ROBOTS[0].sensor)
+    assert note.startswith("mount: the sensor's place on the base is not learnt")

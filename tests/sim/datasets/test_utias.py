@@ -13,20 +13,22 @@ from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.utias import landmark_shift, utias, write_utias
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.publisher.node import WorldNode
-from teamslam.sim.scenarios.scenario import dumps, load, loads, with_options
+from teamslam.sim.scenarios.scenario import Scenario, dumps, load, loads, with_options
 from teamslam.sim.scenarios.source import (
     open_data_set,
     scenario_beside,
     streams_of,
     with_present_robots,
 )
+from teamslam.sim.studies.experiments.accuracy_starts import is_wrong, unknown_starts
+from teamslam.sim.studies.experiments.team_runs import Figures, team_figures
 from teamslam.sim.world.config import UtiasWorld
 from teamslam.sim.world.streams import OBSERVATIONS, ODOMETRY, START, RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire import messages as m
 from tests import build
 from tests.commands import run
-from tests.scenarios import with_front_ends, with_world
+from tests.scenarios import with_front_ends, with_robots, with_world
 
 REAL = Path(__file__).parents[4] / "shared" / "utias"
 
@@ -387,3 +389,25 @@ def test_in_the_real_set_1_landmarks_11_and_17_are_put_right():
     for landmark in (11, 17):
         assert np.percentile(np.abs(range_errors(mended, landmark)), 90) < 0.5
         assert np.percentile(np.abs(range_errors(raw, landmark)), 50) > 0.5
+
+
+SET_6 = Path(__file__).parents[4] / "shared" / "utias" / "MRCLAM_Dataset6.zip"
+
+
+def slice_of_set_6() -> Scenario:
+    scenario = with_options(load("utias"), dataset=SET_6)
+    return with_robots(with_world(scenario, duration_s=100.0), pose_s=60.0)
+
+
+def figures(scenario: Scenario) -> Figures:
+    return team_figures(evaluate(run_team(scenario, streams_of(scenario))))
+
+
+@pytest.mark.skipif(not SET_6.exists(), reason="the data set is not here: it is not shipped")
+def test_one_declared_start_gives_the_map_that_five_give_and_joins_nobody_wrongly():
+    declared = figures(slice_of_set_6())
+    found = figures(unknown_starts(slice_of_set_6()))
+    assert found["not_joined"] == []
+    assert not any(is_wrong(each["first_pose_chi2"]) for each in found["robots"].values())
+    assert found["landmarks"] == declared["landmarks"]
+    assert found["rmse_aligned"] == pytest.approx(declared["rmse_aligned"], rel=0.1)

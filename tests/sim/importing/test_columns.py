@@ -122,8 +122,9 @@ def test_robots_with_other_columns_have_tables_of_their_own_in_one_map(tmp_path,
     check_team(tmp_path / "set")
     unknown = columns.read_text().replace("[robots.bob", "[robots.eve")
     columns.write_text(unknown)
-    refused = refusal(logs, "-o", tmp_path / "eve", "--columns", columns)
-    assert "/" not in layout or "[robots.eve]: no files of such a robot" in refused
+    if "/" in layout:
+        refused = refusal(logs, "-o", tmp_path / "eve", "--columns", columns)
+        assert "[robots.eve]: no files of such a robot" in refused
     columns.write_text(unknown.replace("[robots.eve", "[robots.Bob"))
     refused = refusal(logs, "-o", tmp_path / "bob", "--columns", columns)
     assert "[robots.Bob]: no robot's name" in refused
