@@ -25,6 +25,7 @@ from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import Intervals, grouped
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
 from tests.commands import output_of, run
+from tests.scenarios import with_world
 from tests.sim.logs import scenario, streams
 
 SECOND = 1_000_000_000
@@ -233,11 +234,11 @@ def test_what_is_learnt_goes_into_the_users_scenario_and_all_else_stays(tmp_path
 
 
 def test_robots_that_teach_nothing_are_named_and_too_short_a_time_of_the_others_is_said(tmp_path):
-    write_utias(streams(scenario(robots=2)), tmp_path / "set")
+    write_utias(streams(with_world(scenario(robots=2), steps=210)), tmp_path / "set")
     (tmp_path / "set" / "Robot2_Groundtruth.dat").unlink()
     said = output_of("calibrate", tmp_path / "set", status=1)
     assert "set r2: no ground truth: nothing is learnt from it" in said
-    assert "these data have 2: give several data sets at once, record 4.7 minutes" in said
+    assert "these data have 20: give several data sets at once, record 1.7 minutes" in said
     assert "where the path is known throughout" in said
 
 
