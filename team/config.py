@@ -216,6 +216,9 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
 
 
+RESET_M, RESET_TIMES, USUAL_M_S, LEAST_STEPS = 0.5, 20.0, 0.25, 10
+"""A reset of odometry poses: least length [m], speed beside the usual one, which is taken to be as
+large at least [m/s], and the least number of steps of which the usual one is known."""
 GATE = 13.8
 """χ² of two degrees of freedom that one in a thousand correct pairs exceeds: −2 ln 10⁻³."""
 

@@ -15,8 +15,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import WireError, decoded, encoded
-from teamslam.team.wire.logs import LOG
-from teamslam.team.wire.text import cut, one_line
+from teamslam.team.wire.logs import LOG, cut, one_line
 
 M = TypeVar("M", bound=m.Message)
 MOST_ANSWERS = 1000  # most attempts of a node to continue after one message

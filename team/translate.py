@@ -16,6 +16,7 @@ from teamslam.team.estimation.contribution import (
     RobotBias,
     Stream,
 )
+from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix
 from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
@@ -253,16 +254,9 @@ def block_bytes(blocks: Float[np.ndarray, "L 2 2"]) -> bytes:
     return from_floats(blocks[:, [0, 0, 1], [0, 1, 1]])
 
 
-def blocks_of(covariance: Matrix) -> Float[np.ndarray, "L 2 2"]:
-    """Return the 2 × 2 diagonal blocks of a joint landmark covariance."""
-    n = len(covariance) // 2
-    grid = covariance.reshape(n, 2, n, 2)
-    return grid[np.arange(n), :, np.arange(n), :]
-
-
 def covariance_bytes(covariance: Matrix, *, joint: bool) -> bytes:
     """Pack a landmark covariance: the joint one, or each landmark's own block."""
-    return joint_bytes(covariance) if joint else block_bytes(blocks_of(covariance))
+    return joint_bytes(covariance) if joint else block_bytes(diagonal_blocks(covariance))
 
 
 def landmark_covariance_of(message: m.MapEstimate | m.FusedMap) -> Matrix:

@@ -19,7 +19,7 @@ from teamslam.central.desk.names import OUTSIDE, in_order
 from teamslam.central.desk.pictures.run import in_the_maps_frame, new_figure, set_up_map
 from teamslam.central.desk.pictures.style import save
 from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable
-from teamslam.team import translate
+from teamslam.team.estimation.dense import diagonal_blocks
 
 Row = tuple[str, tuple[str, ...]]
 MAP_STYLES = ((BLUE, "."), (VERMILION, "+"))
@@ -159,7 +159,7 @@ def draw_maps(runs: Mapping[str, Evaluation], path: Path) -> bool:
         if (fused := run.map) is not None:
             x, y = fused.means.T
             axis.plot(x, y, marker, color=colour, markersize=8, markerfacecolor="none", label=name)
-            draw_ellipses(axis, fused.means, translate.blocks_of(fused.covariance), colour)
+            draw_ellipses(axis, fused.means, diagonal_blocks(fused.covariance), colour)
     set_up_map(axis)
     axis.set_title("Final maps with 95 % ellipses", fontsize=12)
     axis.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3, frameon=False)

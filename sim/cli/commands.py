@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, NoReturn, TypeVar, get_args, get_or
 import click
 from click.exceptions import Exit
 
-from teamslam.team.wire.text import printable_lines
+from teamslam.team.wire.logs import printable_lines
 
 ARGUMENTS = "Arguments"
 OPTIONS = "Options"  # section of the options that most users need

@@ -12,7 +12,7 @@ from teamslam.sim.cli import options as opt
 from teamslam.sim.cli.commands import FAILED, Group, argument, option, output_option, refuse
 from teamslam.sim.cli.recorded import repair
 from teamslam.team.extras import install_command
-from teamslam.team.wire.text import one_line
+from teamslam.team.wire.logs import one_line
 
 if TYPE_CHECKING:
     from rich.table import Table

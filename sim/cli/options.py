@@ -20,7 +20,7 @@ from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, load, loads
 from teamslam.sim.world.config import GraphWorld, UnlabelledWorld
 from teamslam.team.config import MAP, Estimator, FusionRule
-from teamslam.team.wire.text import one_line
+from teamslam.team.wire.logs import one_line
 
 if TYPE_CHECKING:
     from teamslam.team.keys.credentials import Credentials

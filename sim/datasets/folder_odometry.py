@@ -14,8 +14,7 @@ from teamslam.sim.datasets.folder_tables import (
 )
 from teamslam.sim.datasets.tables import DatasetError, on_circle
 from teamslam.sim.world.streams import Intervals, moved
-from teamslam.team.config import Bounds
-from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
+from teamslam.team.config import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S, Bounds
 from teamslam.team.shapes import Bool, Float, Int64
 
 FORMS = (SPEEDS, STEERED, POSES, INCREMENTS)

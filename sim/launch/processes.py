@@ -13,7 +13,7 @@ from pathlib import Path
 
 from teamslam.team.end_query import SINCE
 from teamslam.team.shell import PARENT
-from teamslam.team.wire.text import one_line
+from teamslam.team.wire.logs import one_line
 
 # -P keeps the working folder off the module path: a user's `sim/` must not shadow ours.
 PROGRAM = (sys.executable, "-P", "-m", "teamslam")

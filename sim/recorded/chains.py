@@ -13,10 +13,9 @@ from teamslam.central.desk.evaluation.errors import Path, on_circle
 from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig, Sensor
-from teamslam.team.estimation.gaussian import Matrix
+from teamslam.team.estimation.gaussian import Matrix, start_of_sensor
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
 from teamslam.team.estimation.models import Increment, noise, segmenter_of
-from teamslam.team.estimation.mount import start_of_sensor
 from teamslam.team.estimation.scans import Own, unclaimed
 from teamslam.team.estimation.se2 import Pose, between, compose, inverse
 from teamslam.team.shapes import Float, Int64, UInt32

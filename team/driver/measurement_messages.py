@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from teamslam.team import core
-from teamslam.team.config import Bounds
-from teamslam.team.odometry_resets import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S
+from teamslam.team.config import LEAST_STEPS, RESET_M, RESET_TIMES, USUAL_M_S, Bounds
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.codec import find_error

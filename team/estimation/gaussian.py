@@ -7,6 +7,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation import dense
+from teamslam.team.estimation.se2 import Pose, compose
 from teamslam.team.shapes import Float, UInt32
 
 Vector = Float[np.ndarray, " n"]
@@ -18,6 +19,24 @@ class PoseGaussian(NamedTuple):
 
     mean: Float[np.ndarray, "3"]
     covariance: Float[np.ndarray, "3 3"]
+
+    def moved_by(self, step: Pose) -> "PoseGaussian":
+        """Compose the pose and an exact motion."""
+        end = compose(self.mean, step)
+        dx, dy = end[:2] - self.mean[:2]
+        F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+        return PoseGaussian(end, dense.congruent(F, self.covariance))
+
+
+def start_of_sensor(
+    pose: Pose, covariance: Matrix | None, mount: Pose
+) -> tuple[Pose, Matrix | None]:
+    """Convert an initial pose of the base to the sensor's; covariance None: exact."""
+    if not mount.any():
+        return pose, covariance
+    found = PoseGaussian(pose, np.zeros((3, 3)) if covariance is None else covariance)
+    found = found.moved_by(mount)
+    return found.mean, None if covariance is None else found.covariance
 
 
 class LandmarkGaussian(NamedTuple):

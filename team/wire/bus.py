@@ -13,8 +13,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.channels import Channel, channel_of, row_of
 from teamslam.team.wire.codec import WireError, decoded, encoded
-from teamslam.team.wire.logs import LOG
-from teamslam.team.wire.text import make_printable
+from teamslam.team.wire.logs import LOG, make_printable
 
 _IN_WORDS = (
     m.Status,

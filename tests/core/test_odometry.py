@@ -9,7 +9,6 @@ from teamslam.team import core
 from teamslam.team.config import UNNAMED, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import OdometryInterval, Scan
 from teamslam.team.estimation.models import Increment, increment_of, model_of, segmenter_of
-from teamslam.team.estimation.mount import of_sensor
 from teamslam.team.estimation.se2 import adjoint, inverse, logarithm
 
 MOTION = MotionModel(
@@ -50,6 +49,10 @@ def composed(steps: list[Increment]) -> Increment:
 def assert_equal(found: tuple[np.ndarray, np.ndarray], expected: Increment) -> None:
     np.testing.assert_array_equal(found[0], expected.mean)
     np.testing.assert_array_equal(found[1], expected.covariance)
+
+
+def of_sensor(step: Increment, mount: np.ndarray) -> Increment:
+    return Increment(*core.motion_of_sensor(step.mean, step.covariance, mount))
 
 
 @pytest.mark.parametrize("mount", [None, MOUNT])

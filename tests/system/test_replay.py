@@ -6,8 +6,8 @@ import zenoh
 
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire.bus import Sample
-from teamslam.team.wire.zenoh.attachment import Attachment, pack
 from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.delivery import Attachment, pack
 from tests.system.conftest import Launched
 from tests.system.processes import until
 

@@ -28,7 +28,7 @@ from teamslam.team.wire.codec import (
     encoded,
     tag_in,
 )
-from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
+from teamslam.team.wire.zenoh.delivery import Attachment, AttachmentError, pack, unpack
 from tests import build
 from tests.support import ROOT, examples, odometry, packed, spd, submap
 

@@ -6,7 +6,7 @@ from teamslam.team.wire import logs
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, open_printable
 from teamslam.team.wire.codec import encoded
-from teamslam.team.wire.text import make_printable, one_line, printable_lines
+from teamslam.team.wire.logs import make_printable, one_line, printable_lines
 from tests import build
 
 HOSTILE = "\x1b]0;owned\x07\x1b[2J\u202etxet\x9b31m\r\n[  1.0 s] forged line"

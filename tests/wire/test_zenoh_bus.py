@@ -17,8 +17,8 @@ from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened
 from teamslam.team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
 from teamslam.team.wire.zenoh import bus as zenoh_bus
 from teamslam.team.wire.zenoh import recovery as recovery_module
-from teamslam.team.wire.zenoh.attachment import Attachment, pack, unpack
 from teamslam.team.wire.zenoh.bus import ZenohBus
+from teamslam.team.wire.zenoh.delivery import Attachment, pack, unpack
 from teamslam.team.wire.zenoh.recovery import Recovery
 from teamslam.team.wire.zenoh.router import router
 from teamslam.team.wire.zenoh.session import client

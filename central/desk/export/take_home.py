@@ -22,6 +22,7 @@ from teamslam.central.survey import datum_of
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.datum import Datum
+from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.geodesy import geodetic_from_local
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.shapes import Float
@@ -119,7 +120,7 @@ def _detections(submap: m.Submap) -> Iterator[tuple[Place, int]]:
 def write_map(fused: MapResult, taken: TakenHome, folder: FilePath) -> list[FilePath]:
     """Write map.csv and map.json with 2 × 2 covariances."""
     datum, states = taken.datum, {each.landmark: each.state for each in fused.changes}
-    upper = translate.blocks_of(fused.covariance)[:, (0, 0, 1), (0, 1, 1)].tolist()
+    upper = diagonal_blocks(fused.covariance)[:, (0, 0, 1), (0, 1, 1)].tolist()
     places = [] if datum is None else geodetic_from_local(datum, fused.means).tolist()
     columns = [*MAP_COLUMNS, *[STATE] * bool(states), *CLASSES * bool(taken.classes)]
     columns += DEGREES * (datum is not None)
@@ -152,7 +153,7 @@ def write_geojson(
 ) -> FilePath:
     """Write map.geojson (RFC 7946); sigma_m: larger semi-axis of the 1σ ellipse."""
     places = geodetic_from_local(datum, fused.means)[:, ::-1].tolist()
-    sigmas = np.sqrt(np.linalg.eigvalsh(translate.blocks_of(fused.covariance))[:, 1]).tolist()
+    sigmas = np.sqrt(np.linalg.eigvalsh(diagonal_blocks(fused.covariance))[:, 1]).tolist()
     features = [
         _feature("Point", place, {"landmark": landmark, "sigma_m": sigma})
         for landmark, place, sigma in zip(fused.ids.tolist(), places, sigmas, strict=True)

@@ -20,6 +20,7 @@ from teamslam.central.desk.pictures.run import (
     set_grid,
 )
 from teamslam.team import translate
+from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
 
@@ -64,7 +65,7 @@ def draw_film(
     paths = {n: r.online_path for n, r in evaluation.robots.items() if len(r.online_path.stamps_ns)}
     if fused is None or not len(fused.ids) or not paths:
         return False
-    final = translate.blocks_of(fused.covariance)
+    final = diagonal_blocks(fused.covariance)
     times = magnification(evaluation, final)
     smoothed = [each.smoothed_path for each in evaluation.robots.values()]
     points = [each.poses[:, :2] for each in (*paths.values(), *smoothed)]

@@ -27,9 +27,9 @@ from teamslam.central.desk.evaluation.history import History
 from teamslam.central.desk.evaluation.results import Evaluation, MapResult, RobotResult
 from teamslam.central.desk.paths import SmoothedPath
 from teamslam.central.desk.pictures.style import save
-from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.consistency import chi2_interval
+from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.shapes import Bool, Float, Int64
 
@@ -213,7 +213,7 @@ def _draw_landmarks(axis: "Axes", evaluation: Evaluation) -> None:
     """
     truth, fused = evaluation.true_landmarks, evaluation.map
     has_map = fused is not None and len(fused.ids) > 0
-    blocks = translate.blocks_of(fused.covariance) if fused is not None and has_map else None
+    blocks = diagonal_blocks(fused.covariance) if fused is not None and has_map else None
     times = 1 if fused is None or blocks is None else magnification(evaluation, blocks)
     if len(truth):
         drawn = truth if fused is None or times == 1 else _magnified_truth(truth, fused, times)

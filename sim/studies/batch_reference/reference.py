@@ -45,7 +45,6 @@ from teamslam.sim.studies.batch_reference.graph import (
     values_of,
 )
 from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
-from teamslam.team.estimation.mount import moved_by
 from teamslam.team.estimation.se2 import inverse, tangent
 from teamslam.team.registry import NotInstalledError
 from teamslam.team.shapes import Float, UInt32
@@ -273,7 +272,7 @@ def _reference_figures(
             errors[robot] = distance_rmse(path.poses[seen, :2], true_poses[seen, :2])
         turn = tangent(sensor[-1, 2])
         P = turn @ marginals.marginalCovariance(last) @ turn.T
-        P = moved_by(PoseGaussian(sensor[-1], P), inverse(chain.mount)).covariance
+        P = PoseGaussian(sensor[-1], P).moved_by(inverse(chain.mount)).covariance
         end = pose_errors(Path(path.stamps_ns[-1:], path.poses[-1:]), P[np.newaxis], true_path)
         if end is not None:
             nees[robot] = end.nees_per_dof

@@ -21,9 +21,9 @@ from teamslam.sim.studies.estimators.fastslam_ml import FastSlamMl
 from teamslam.sim.studies.estimators.localisation import Localisation
 from teamslam.sim.studies.estimators.plain_fastslam import PlainFastSlam
 from teamslam.sim.studies.estimators.robot_step import RobotStep, innovation, uncertain_start
-from teamslam.team import translate
 from teamslam.team.config import UNNAMED, Estimator, RobotConfig, Sensor
 from teamslam.team.core import OdometryInterval
+from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
@@ -224,7 +224,7 @@ def _at_pose(make: Callable[[np.ndarray, int], Any]) -> InitialState:
 
 def _absorb(absorb_map: Callable[..., Any]) -> Callable[[Any, np.ndarray, np.ndarray, Matrix], Any]:
     return lambda state, ids, means, covariance: absorb_map(
-        state, ids, means, translate.blocks_of(covariance)
+        state, ids, means, diagonal_blocks(covariance)
     )
 
 

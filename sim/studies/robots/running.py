@@ -12,10 +12,14 @@ from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep
 from teamslam.sim.studies.robots.filters import FILTERS, Estimates, KnownMap
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
-from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
+from teamslam.team.estimation.gaussian import (
+    LandmarkGaussian,
+    NotACovarianceError,
+    PoseGaussian,
+    start_of_sensor,
+)
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, generator
 from teamslam.team.estimation.models import Increment, segmenter_of
-from teamslam.team.estimation.mount import moved_by, start_of_sensor
 from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
@@ -186,7 +190,7 @@ class RunningEstimator:
         """Pose at the last keyframe."""
         pose = self._filter.pose(self._state)
         if self._config.sensor.is_mounted:
-            pose = moved_by(pose, inverse(self._mount))
+            pose = pose.moved_by(inverse(self._mount))
         return PoseGaussian(pose.mean, pose.covariance + POSE_FLOOR)
 
     def own_map(self) -> LandmarkGaussian:

@@ -16,7 +16,6 @@ from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, RobotConfig
 from teamslam.team.estimation.gaussian import Matrix, PoseGaussian
-from teamslam.team.estimation.mount import moved_by
 from teamslam.team.estimation.se2 import Pose, inverse
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire.bus import Outgoing
@@ -128,7 +127,7 @@ class BatchCentre(MeasurementCentre):
             if sensor.is_mounted:
                 away = inverse(np.array(sensor.mount))
                 moved = [
-                    moved_by(PoseGaussian(*each), away)
+                    PoseGaussian(*each).moved_by(away)
                     for each in zip(poses, covariances, strict=True)
                 ]
                 poses = np.array([each.mean for each in moved])

@@ -24,9 +24,9 @@ from teamslam.team.estimation.gaussian import (
     Matrix,
     NotACovarianceError,
     PoseGaussian,
+    start_of_sensor,
 )
 from teamslam.team.estimation.hybrid_slam.window import generator
-from teamslam.team.estimation.mount import moved_by, start_of_sensor
 from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.se2 import Pose, inverse
 from teamslam.team.wire import channels as ch
@@ -211,7 +211,7 @@ class MeasurementCentre(ComparisonCentre):
         self._pose_ns[each.robot] = each.stamp_ns
         sensor = self.models[each.robot].sensor
         if sensor.is_mounted:
-            pose = moved_by(pose, inverse(np.array(sensor.mount)))
+            pose = pose.moved_by(inverse(np.array(sensor.mount)))
         incarnation = self.members[each.robot].incarnation
         mean, covariance = core.pose_bytes(*pose)
         message = m.PoseEstimate(

@@ -115,10 +115,6 @@ class OpenWindow:
         except UNSOLVED:
             return None
 
-    def is_sensible(self, submap: LocalMap | None) -> bool:
-        """Return whether there is a submap within the bounds."""
-        return submap is not None and submap_beyond(submap, self._config.bounds) is None
-
     def _settle(self) -> None:
         has_others = self.core.confirm()
         if self.core.has_unnamed:
@@ -249,7 +245,8 @@ class HybridSlam:
         self._open.confirm()
         self._open.core.move(rest)
         submap = self._open.solve(windows.gaussian)
-        is_sensible = self._open.is_sensible(submap)
+        if submap is not None and submap_beyond(submap, self._config.bounds) is not None:
+            submap = None
         uncovered = self.segmenter.uncovered
         scans, self._scans = self._scans - uncovered, uncovered
         closed = ClosedWindow(
@@ -258,12 +255,12 @@ class HybridSlam:
             last_measurement=self.last_measurement,
             start_ns=start_ns,
             end_ns=end_ns,
-            local=submap if is_sensible and submap is not None else self._moved_alone(),
+            local=submap or self._moved_alone(),
             gated=self._open.gated,
             late=late,
-            unsolved=0 if is_sensible else scans - late,
+            unsolved=0 if submap is not None else scans - late,
         )
-        if submap is not None and is_sensible:
+        if submap is not None:
             found = self._open.settled
             closed = replace(
                 closed,

@@ -19,11 +19,18 @@ from zenoh.handlers import Callback
 from teamslam.team.wire.bus import Answer, BusError, Outgoing, Sample, Tap, read_reply
 from teamslam.team.wire.channels import ALIVE, KEPT, REPLIES, TALLY, Channel, row_of
 from teamslam.team.wire.codec import LARGEST_PAYLOAD, WireError, encoded
-from teamslam.team.wire.logs import LOG
+from teamslam.team.wire.logs import LOG, cut
 from teamslam.team.wire.messages import Liveliness, Message, Tally
-from teamslam.team.wire.text import cut
-from teamslam.team.wire.zenoh.attachment import Attachment, AttachmentError, pack, unpack
-from teamslam.team.wire.zenoh.delivery import PRIORITY, Publisher, declare_publisher, subscribe
+from teamslam.team.wire.zenoh.delivery import (
+    PRIORITY,
+    Attachment,
+    AttachmentError,
+    Publisher,
+    declare_publisher,
+    pack,
+    subscribe,
+    unpack,
+)
 from teamslam.team.wire.zenoh.recovery import Recovery, Work
 from teamslam.team.wire.zenoh.session import RouterLink, client
 

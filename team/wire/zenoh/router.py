@@ -18,7 +18,7 @@ from teamslam.team.wire.codec import WireError, decoded
 from teamslam.team.wire.logs import LOG
 from teamslam.team.wire.messages import KeptRequest
 from teamslam.team.wire.zenoh.access import access_control
-from teamslam.team.wire.zenoh.attachment import AttachmentError, unpack
+from teamslam.team.wire.zenoh.delivery import AttachmentError, unpack
 from teamslam.team.wire.zenoh.session import ACCEPTED, DOOR, REVOKED, open_session, tls_settings
 from teamslam.team.wire.zenoh.stored_samples import StoredMessages
 
