@@ -35,10 +35,7 @@ from teamslam.team.estimation.map_joining.submap_graph import (
 from teamslam.team.shapes import Float, Int64
 
 Values = Float[np.ndarray, " _"]
-HALVINGS = 4
-"""Halvings of an undamped step before damping: in the long curved valleys of odometry damped steps
-are very short.
-"""
+HALVINGS = 4  # of an undamped step before damping, whose steps are short in curved valleys
 MOST_DAMPING = 1e8
 STUCK = math.inf  # damping of a point from which no step lowers the cost
 
@@ -74,18 +71,15 @@ def _narrowing(start: float, decay: float) -> Float[np.ndarray, " k"]:
 
 
 STILL = 1e-3
-"""Squared length, in standard deviations and per raw submap, of a step that a running map omits: a
-tenth of the shift by condensing (docs/decisions/25).
+"""Squared length, in standard deviations per raw submap, of a step that a running map omits
+(docs/decisions/25).
 """
 LANDMARK_GATE = 13.8  # χ² of two numbers that a sound landmark exceeds with probability 10⁻³
 PLAIN = 1e9  # widening of gates beyond every χ²
-LIKELY = 0.999
-"""Quantile of χ² above which a cost is suspicious, and a rise of the cost makes a
-minimum unlikely.
-"""
+LIKELY = 0.999  # quantile of χ² above which a cost is suspicious, or a minimum unlikely
 SUSPICIOUS = 1.3
-"""Factor by which a suspicious cost also exceeds its degrees of freedom, since submaps are only
-nearly Gaussian.
+"""Factor by which a suspicious cost also exceeds its degrees of freedom: submaps are only nearly
+Gaussian.
 """
 FULL_AGE = 1_000_000  # iterations after which every robust scale is final
 
@@ -96,14 +90,13 @@ class JoinSettings:
 
     robust: factors beyond their gates are discounted. The gates of χ² are wider by robust_start² at
     first, and by robust_decay² less with each iteration, down to 1. submap_gate: factor on a
-    submap's gate. landmark_gate: χ² of two numbers from which a submap's landmark is discounted.
-    max_iterations, step_tolerance: end of a full solve, by number or largest change [m, rad].
-    alignment_confidence, alignment_heading_sigma: for a merge of islands, quantile of the χ² test
-    and largest `Alignment.heading_sigma` [rad]. bias_sigma: scale of Student's t prior on each
-    error of a robot's submaps. common_bias_sigma: standard deviation of those that all robots
-    share; "marker": share of the range. joined_ranges: see `core.SubmapFactor.at_joined_ranges`.
-    landmark_sigma: standard deviation [m] of the measured point about the landmark's place: part of
-    a map's covariance, not of the weights.
+    submap's gate. landmark_gate: χ² from which a submap's landmark is discounted. max_iterations,
+    step_tolerance: end of a full solve, by number or largest change [m, rad]. alignment_confidence,
+    alignment_heading_sigma: for a merge, quantile of the χ² test and largest
+    `Alignment.heading_sigma` [rad]. bias_sigma: scale of Student's t prior on each error of a
+    robot's submaps; common_bias_sigma: of those that all robots share. joined_ranges: see
+    `core.SubmapFactor.at_joined_ranges`. landmark_sigma: deviation [m] of the measured point about
+    the landmark's place, added to a map's covariance.
     """
 
     iterations_per_tick: int = 2
@@ -306,10 +299,8 @@ def is_solvable(island: Island) -> bool:
 
 
 def iterate_tick(island: Island) -> Island:
-    """Apply the iterations of one tick.
-
-    With condensed submaps, later ones shorter than STILL are omitted: condensing displaces the map
-    more.
+    """Apply the iterations of one tick; with condensed submaps, later ones shorter than STILL are
+    omitted.
     """
     damping = 0.0
     bounded = island.graph.condensed is not None
@@ -329,8 +320,7 @@ def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
     """Take one step: return the island, the next damping, and the full step's largest change.
 
     The step −(A + damping · diag A)⁻¹g is applied if it lowers the cost; else, if undamped, a share
-    of it; else a more damped one. If none does, the state stays and the next damping is STUCK, from
-    which a step begins undamped.
+    of it; else a more damped one. If none does, the state stays and the next damping is STUCK.
     """
     with island.determined():
         state, damping, change = island.estimate.take_step(
@@ -345,9 +335,7 @@ def take_step(island: Island, damping: float) -> tuple[Island, float, float]:
 def solve_island(island: Island) -> tuple[Island, int, float]:
     """Solve in full; return also the number of iterations and the last change [m, rad].
 
-    Least squares first, which is the robust solution without factors beyond their gates; otherwise
-    the gates narrow anew. A solve ends when converged, after `max_iterations`, or if no step lowers
-    the cost.
+    Least squares comes first: it is the robust solution where no factor is beyond its gate.
     """
     if island.settings.robust:
         with suppress(*UNSOLVABLE):

@@ -1,9 +1,8 @@
 """The team's map as a fold over its submaps in their canonical order.
 
 Joining minimises Σ ‖z − h(start pose, end pose, landmarks)‖² in the metric P⁻¹ over the submaps of
-all robots, and over the inter-robot measurements between their pose nodes. The fold is a pure
-function of the order and the ticks' boundaries. A stream with an unknown initial pose is an island
-until shared landmarks and inter-robot measurements tie it to the main island.
+all robots, and over the inter-robot measurements between their pose nodes. A stream with an unknown
+initial pose is an island until shared landmarks and inter-robot measurements tie it to another.
 """
 
 import math
@@ -98,9 +97,8 @@ PATIENCE = 1.1  # growth in submaps after which a failed search is repeated
 class Tick:
     """The contents of one tick, in canonical order.
 
-    sightings: inter-robot measurements from the submaps' poses. starts: initial poses of the
-    streams that begin. outside: reason for each submap refused in advance; set_aside: other
-    refusals. verdicts: an operator's, on landmarks of submaps up to here.
+    starts: of the streams that begin. outside: reason for each submap refused in advance;
+    set_aside: other refusals. verdicts: an operator's, on landmarks of submaps up to here.
     """
 
     contributions: Sequence[Contribution]
@@ -124,16 +122,15 @@ class Audit:
 class Fold:
     """The islands solved so far, and the bookkeeping of their submaps.
 
-    home: island (a key of `islands`) of each stream. reasons: why an island is not merged, by its
-    frame. joined: each merge and its certainty, by the former frame. warnings: signs of another
-    minimum; rival_m: its distance [m], if about as likely. waiting: inter-robot measurements
-    between two islands. judged: number of submaps of two islands at their last failed merge, and
-    its reason; ambiguous: where several alignments passed; searched_at: number at an island's last
-    failed search for a lower minimum. iterations, change: of the main island's last full solution
-    [m, rad]. refused: submaps not in the map, with the reason (`refusal`); motion_only: those with
-    their motion in the map; left_out: inter-robot measurements without a solution; set_aside: other
-    refusals. audits: closures that may be undone (`auditing`). cuts: seams that cut a stream into
-    parts (`continuity`).
+    home: island of each stream. reasons: why an island is not merged, by its frame. joined: each
+    merge, by the former frame. warnings: signs of another minimum; rival_m: its distance [m], if
+    about as likely. waiting: inter-robot measurements between two islands. judged: number of
+    submaps of two islands at their last failed merge, and its reason; ambiguous: where several
+    alignments passed; searched_at: at an island's last failed search for a lower minimum.
+    iterations, change: of the main island's last full solution [m, rad]. refused: submaps not in
+    the map, with the reason (`refusal`); motion_only: those with their motion in the map; left_out:
+    inter-robot measurements without a solution; set_aside: other refusals. audits: closures that
+    may be undone (`auditing`). cuts: seams that cut a stream (`continuity`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -160,7 +157,7 @@ class Fold:
 
     @property
     def condensed_count(self) -> int:
-        """Number of condensed submaps, none of `contributions`."""
+        """Number of condensed submaps."""
         return self.size - len(self.contributions)
 
     @property
@@ -294,10 +291,7 @@ def compact_fold(fold: Fold) -> Fold:
 
 
 def solve_fold(fold: Fold, settings: JoinSettings) -> Fold:
-    """Solve every island in full.
-
-    `warnings` reports other minima, and islands without a full solution, which keep their state.
-    """
+    """Solve every island in full; one without a solution keeps its state."""
     if fold.main_key is None:
         return fold
     with np.errstate(all="ignore"):  # an overflow has no finite cost, and is not accepted
@@ -336,10 +330,8 @@ def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold
 
 
 def separate_moved(fold: Fold, chance: float, newest: Sequence[Contribution] | None = None) -> Fold:
-    """Separate the landmarks that have moved since a saved map from their former places.
-
-    The worst first, with a solution before the next test. newest: submaps whose landmarks are
-    tested; None: all.
+    """Separate the landmarks that have moved since a saved map from their former places, the worst
+    first. newest: submaps whose landmarks are tested; None: all.
     """
     islands = dict(fold.islands)
     for key, island in fold.islands.items():

@@ -13,7 +13,7 @@ distance d, is estimated from all its submaps and landmarks and averaged over th
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,8 +44,6 @@ twice.
 NODES = ((0.0, 2.0 / 3.0), (math.sqrt(3.0), 1.0 / 6.0), (-math.sqrt(3.0), 1.0 / 6.0))
 """Nodes and weights of the Gauss-Hermite rule of three points."""
 
-Misses = Float[np.ndarray, "K n"]
-
 
 class _Place(NamedTuple):
     """A candidate: rows of the submaps before and after a seam in a stream, and its evidence."""
@@ -59,44 +57,54 @@ class _Place(NamedTuple):
 class _Sights:
     """Observations of n unnamed landmarks, by node, in K submaps.
 
-    counts: measurements of each landmark. away: distance [m] of each from each submap's path.
+    stable: landmarks of LEAST_COUNT or more measurements. away: distance [m] of each from each
+    submap's path. misses: −ln P(the submap misses the landmark). possible: pairs of landmarks that
+    may be one.
     """
 
     submaps: list[Joined]
     nodes: Int64[np.ndarray, " n"]
     points: Float[np.ndarray, "n 2"]
     sees: Bool[np.ndarray, "K n"]
-    counts: Int64[np.ndarray, " n"]
+    stable: Bool[np.ndarray, " n"]
     away: Float[np.ndarray, "K n"]
+    misses: Float[np.ndarray, "K n"]
+    possible: Bool[np.ndarray, "n n"]
+
+    def rows_of(self, stream: Stream) -> list[int]:
+        """List the rows of a stream's submaps."""
+        return [k for k, each in enumerate(self.submaps) if each.contribution.stream == stream]
+
+    def with_misses(self, spread: Float[np.ndarray, "K n"]) -> "_Sights":
+        """Compute `misses` with standard deviations [m] of the distances."""
+        misses = np.zeros(self.away.shape)
+        robots = np.array([each.contribution.robot for each in self.submaps])
+        for robot in sorted({*robots.tolist()}):
+            own = robots == robot
+            away, seen = self.away[np.ix_(own, self.stable)], self.sees[np.ix_(own, self.stable)]
+            if seen.any():
+                rate = learn_rate(away.ravel(), seen.ravel(), unseen=1.0)
+                far = self.away[own], spread[own]
+                p = sum(weight * rate.at(np.abs(far[0] + z * far[1])) for z, weight in NODES)
+                misses[own] = -core.log(np.maximum(1.0 - p, LEAST_OVERLOOKED))
+        return replace(self, misses=misses)
 
 
 def find_late_seam(island: Island) -> Seam | None:
     """Find the seam with the most evidence, at least LATE_EVIDENCE, among unnamed landmarks."""
     sights = _sights_of(island)
-    streams = sorted({each.contribution.stream for each in sights.submaps})
-    if not len(sights.nodes):
+    if not len(sights.nodes) or not _best_places(sights):
         return None
-    nothing = np.zeros((len(sights.nodes),) * 2, np.bool_)
-    roughly = _misses(sights, np.zeros_like(sights.away))
-    found = [(stream, _best_place(sights, stream, roughly, nothing)) for stream in streams]
-    if not any(place.evidence >= LATE_EVIDENCE for _, places in found for place in places):
+    places = _best_places(_with_uncertainty(island, sights))
+    if not places:
         return None
-    spread, possible = _uncertainty_of(island, sights)
-    misses = _misses(sights, spread)
-    best: tuple[float, Stream, list[_Place]] | None = None
-    for stream in streams:
-        places = _best_place(sights, stream, misses, possible)
-        evidence = max((each.evidence for each in places), default=0.0)
-        if evidence >= LATE_EVIDENCE and (best is None or evidence > best[0]):
-            best = evidence, stream, places
-    if best is None:
-        return None
-    evidence, stream, places = best
-    rows, after = _rows_of(sights, stream), max(each.after for each in places)
+    stream = sights.submaps[places[0].before].contribution.stream
+    rows, after = sights.rows_of(stream), max(each.after for each in places)
     first, previous, last = (
         sights.submaps[row].contribution
         for row in (min(each.before for each in places), rows[rows.index(after) - 1], after)
     )
+    evidence = max(each.evidence for each in places)
     return Seam(stream, first.sequence, last.sequence, first.end_ns, previous.end_ns, evidence)
 
 
@@ -106,46 +114,28 @@ def _sights_of(island: Island) -> _Sights:
     nodes = np.array(
         sorted(node for id_, node in graph.landmarks.items() if id_ >= UNNAMED), np.int64
     )
+    n = len(nodes)
     place = np.full(len(graph.fixed) + 1, -1, np.int64)
-    place[nodes] = np.arange(len(nodes))
-    sees = np.zeros((len(submaps), len(nodes)), np.bool_)
-    counts = np.zeros(len(nodes), np.int64)
+    place[nodes] = np.arange(n)
+    sees = np.zeros((len(submaps), n), np.bool_)
+    counts = np.zeros(n, np.int64)
     for row, each in zip(sees, submaps, strict=True):
         local = each.contribution.local
         own = place[each.landmarks[local.ids >= UNNAMED]]
         row[own[own >= 0]] = True
         np.add.at(counts, own[own >= 0], local.unnamed.counts[own >= 0].astype(np.int64))
     points = island.points(nodes)
-    away = np.array([distances(path_of(island, each), points) for each in submaps])
-    return _Sights(submaps, nodes, points, sees, counts, away.reshape(sees.shape))
+    paths = [distances(path_of(island, each), points) for each in submaps]
+    away = np.array(paths).reshape(sees.shape)
+    nothing = np.zeros((n, n), np.bool_)
+    stable = counts >= LEAST_COUNT
+    sights = _Sights(submaps, nodes, points, sees, stable, away, np.zeros_like(away), nothing)
+    return sights.with_misses(np.zeros_like(away))
 
 
-def _rows_of(sights: _Sights, stream: Stream) -> list[int]:
-    streams = [each.contribution.stream for each in sights.submaps]
-    return [k for k, each in enumerate(streams) if each == stream]
-
-
-def _misses(sights: _Sights, spread: Float[np.ndarray, "K n"]) -> Misses:
-    """Compute −ln P(a submap misses a landmark); spread: deviation [m] of the distances."""
-    out = np.zeros(sights.away.shape)
-    robots = np.array([each.contribution.robot for each in sights.submaps])
-    stable = sights.counts >= LEAST_COUNT
-    for robot in sorted({*robots.tolist()}):
-        own = robots == robot
-        away, seen = sights.away[np.ix_(own, stable)], sights.sees[np.ix_(own, stable)]
-        if not seen.any():
-            continue
-        rate = learn_rate(away.ravel(), seen.ravel(), unseen=1.0)
-        p = sum(weight * rate.at(np.abs(sights.away[own] + z * spread[own])) for z, weight in NODES)
-        out[own] = -core.log(np.maximum(1.0 - p, LEAST_OVERLOOKED))
-    return out
-
-
-def _uncertainty_of(
-    island: Island, sights: _Sights
-) -> tuple[Float[np.ndarray, "K n"], Bool[np.ndarray, "n n"]]:
-    """Compute the standard deviation of the distances of landmarks from the submaps' nearer ends,
-    and which landmarks may be one.
+def _with_uncertainty(island: Island, sights: _Sights) -> _Sights:
+    """Weigh the misses by the standard deviation of the distances of landmarks from the submaps'
+    nearer ends, and find the landmarks that may be one.
     """
     graph, points, n = island.graph, sights.points, len(sights.nodes)
     ends = np.array([each.nodes[:2] for each in sights.submaps])
@@ -172,29 +162,34 @@ def _uncertainty_of(
         difference = blocks + of_end - cross - cross.transpose(0, 2, 1)
         variance = np.einsum("ni,nij,nj->n", along, difference, along)
         row[:] = np.sqrt(np.maximum(variance, 0.0))
-    return spread, possible
+    return replace(sights.with_misses(spread), possible=possible)
 
 
-def _best_place(
-    sights: _Sights, stream: Stream, misses: Misses, possible: Bool[np.ndarray, "n n"]
-) -> list[_Place]:
-    rows = _rows_of(sights, stream)
-    places = list(_list_places(sights, rows, misses, possible))
-    if not places:
+def _best_places(sights: _Sights) -> list[_Place]:
+    """Find the place with the most evidence of any stream, at least LATE_EVIDENCE, with its
+    neighbours of about the same evidence; empty if there is none.
+    """
+    streams = sorted({each.contribution.stream for each in sights.submaps})
+    found = [list(_list_places(sights, stream)) for stream in streams]
+    places = max(found, key=_most_evidence, default=[])
+    most = _most_evidence(places)
+    if most < LATE_EVIDENCE:
         return []
-    best = max(range(len(places)), key=lambda k: places[k].evidence)
-    least = places[best].evidence - AMBIGUOUS
+    best = [each.evidence for each in places].index(most)
     low = high = best
-    while low > 0 and places[low - 1].evidence >= least:
+    while low > 0 and places[low - 1].evidence >= most - AMBIGUOUS:
         low -= 1
-    while high + 1 < len(places) and places[high + 1].evidence >= least:
+    while high + 1 < len(places) and places[high + 1].evidence >= most - AMBIGUOUS:
         high += 1
     return places[low : high + 1]
 
 
-def _list_places(
-    sights: _Sights, rows: list[int], misses: Misses, possible: Bool[np.ndarray, "n n"]
-) -> Iterator[_Place]:
+def _most_evidence(places: Sequence[_Place]) -> float:
+    return max((each.evidence for each in places), default=0.0)
+
+
+def _list_places(sights: _Sights, stream: Stream) -> Iterator[_Place]:
+    rows = sights.rows_of(stream)
     for k in range(LEAST_BEFORE, len(rows)):
         before, row = rows[k - 1], rows[k]
         for after in (k, k + 1):
@@ -205,39 +200,30 @@ def _list_places(
             )
             if after == len(rows) or tracked > MOST_TRACKED:
                 continue
-            sides, common, fresh = _weigh_place(sights, rows, (k, after), misses, possible)
+            sides, common, fresh = _weigh_place(sights, rows, (k, after))
             if common > MOST_COMMON or fresh <= common or min(sides) < MOST_ABSENT:
                 continue
-            evidence = sum(sides) - PRESENT * float(common)
-            yield _Place(before, rows[after], evidence)
+            yield _Place(before, rows[after], sum(sides) - PRESENT * float(common))
 
 
 def weigh_places(island: Island, places: Sequence[tuple[Stream, int]]) -> list[float]:
     """Compute the evidence for places (stream, sequence) that no landmark spans."""
     if not places:
         return []
-    sights = _sights_of(island)
-    spread, possible = _uncertainty_of(island, sights)
-    misses, found = _misses(sights, spread), []
+    sights, found = _with_uncertainty(island, _sights_of(island)), []
     for stream, first in places:
-        rows = _rows_of(sights, stream)
+        rows = sights.rows_of(stream)
         k = [sights.submaps[row].contribution.sequence for row in rows].index(first)
-        sides, _, _ = _weigh_place(sights, rows, (k, k), misses, possible)
-        found.append(sum(sides))
+        found.append(sum(_weigh_place(sights, rows, (k, k))[0]))
     return found
 
 
 def _weigh_place(
-    sights: _Sights,
-    rows: list[int],
-    place: tuple[int, int],
-    misses: Misses,
-    possible: Bool[np.ndarray, "n n"],
+    sights: _Sights, rows: list[int], place: tuple[int, int]
 ) -> tuple[list[float], int, int]:
     """Return the evidence of each side of a place (k, after), the number of common landmarks, and
     of those of the submaps `rows[after:]` alone; rows[k:after] is on neither side.
     """
-    stable = sights.counts >= LEAST_COUNT
     behind = np.zeros(len(sights.submaps), np.bool_)
     behind[rows[place[1] :]] = True
     ahead = ~behind
@@ -246,8 +232,8 @@ def _weigh_place(
     sides: list[float] = []
     fresh = 0
     for own, other, by in ((one, two, behind), (two, one, ahead)):
-        alone = own & ~other & stable & ~possible[:, other].any(axis=1)
-        missed = np.minimum(misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT)
+        alone = own & ~other & sights.stable & ~sights.possible[:, other].any(axis=1)
+        missed = np.minimum(sights.misses[np.ix_(by, alone)].sum(axis=0), MOST_ABSENT)
         sides.append(float(missed.sum()))
         fresh = int(alone.sum())
     return sides, int((one & two).sum()), fresh

@@ -61,8 +61,7 @@ class Trajectory(NamedTuple):
 class EndPoses(NamedTuple):
     """End poses of a stream's submaps, each with its covariance.
 
-    start: of the first submap. crosses: covariance of each pose with the previous one, first the
-    start.
+    crosses: covariance of each pose with the previous one, first the start.
     """
 
     poses: Float[np.ndarray, "K 3"]
@@ -90,11 +89,8 @@ class SightingCost(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Joint cost Σ w χ² and its degrees of freedom, in total, per robot and per submap; unweighted
-    χ² of the inter-robot measurements, oldest first.
-
-    An inter-robot measurement counts for its observer, a discounted landmark by its weight. A
-    chi2/dof that stays above 1.1 is a warning; above 1.3 the covariances cannot be trusted.
+    """Joint cost Σ w χ² and its degrees of freedom, in total, per robot (an inter-robot measurement
+    counts for its observer) and per submap; the inter-robot measurements, oldest first.
     """
 
     chi2: float
@@ -142,9 +138,7 @@ def _found_biases(island: Island) -> list[BiasEstimate]:
 
 
 class Scatter(NamedTuple):
-    """Standard deviation of a shared error by the submaps' scatter, and the freedom
-    of its square.
-    """
+    """Standard deviation of a shared error by the submaps' scatter, and its square's freedom."""
 
     sigma: float
     freedom: float
@@ -197,11 +191,8 @@ def scatter_of_series(chains: Sequence[Float[np.ndarray, " _"]]) -> Scatter:
 
 
 def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
-    """List the main island's landmarks in at least `submaps` believed submaps, and those of a saved
-    map.
-
-    Unnamed ones need the larger of `submaps` and `unnamed`. Submaps with a landmark's weight below
-    BELIEVED do not count: contradictory observations do not confirm each other.
+    """List the main island's landmarks in at least `submaps` submaps where their weight is at least
+    BELIEVED, unnamed ones in the larger of `submaps` and `unnamed`, and those of a saved map.
     """
     island = fold.main
     if submaps <= 1 and unnamed <= 1:
@@ -266,7 +257,7 @@ def main_priors(
     """Make the priors (`prior_for`) of streams of the main island.
 
     chosen: landmarks by ascending id; None: all. most: largest number in a prior, those nearest to
-    its pose. Without the others the robot's pose is less accurate, and as consistent.
+    its pose.
     """
     island = fold.main
     ids = np.array(known(island) if chosen is None else chosen)
@@ -322,8 +313,7 @@ def _cross(island: Island, row: int, column: int) -> Float[np.ndarray, "3 3"]:
 class Terms(NamedTuple):
     """Agreement of each factor: submaps, then priors, then inter-robot measurements.
 
-    submaps: without discounts. robots: of each factor. counted: rows w χ² and dof of the joint
-    cost.
+    submaps: without discounts. robots: of each factor. counted: w χ² and dof of the joint cost.
     """
 
     submaps: SubmapCosts
@@ -398,8 +388,8 @@ def scale_of(costs: SubmapCosts, of: Sequence[int] | slice = ALL) -> Scale | Non
 def unbounded_costs(island: Island) -> SubmapCosts:
     """Evaluate the agreement of the submaps without distortion by the robust loss.
 
-    Covariances far too small put sound submaps beyond their gates. The island is therefore solved
-    with the covariances times its scale; the costs are for its own covariances.
+    Where covariances are far too small, the island is solved with their scale; the costs are for
+    its own covariances.
     """
     found, settings = terms(island).submaps, island.settings
     scale = scale_of(found)
@@ -444,10 +434,7 @@ def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
 
 
 def joint_cost(fold: Fold) -> Agreement:
-    """Evaluate the agreement of the main island's submaps.
-
-    Condensed submaps count at condensing; the newest are listed.
-    """
+    """Evaluate the agreement of the main island's submaps, condensed ones as of condensing."""
     found = terms(fold.main)
     old = fold.main.graph.condensed
     departed = NOBODY if old is None else old.departed

@@ -1,7 +1,5 @@
-"""The factor graph of one frame: poses, landmarks, biases; submaps, inter-robot measurements,
-priors.
-
-A `Graph` is the structure, independent of the state.
+"""The factor graph of one frame, without its state: poses, landmarks, biases; submaps, inter-robot
+measurements, priors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,18 +44,14 @@ CommonError = Bias | int
 measure that landmark too far.
 """
 SharedError = CommonError | RobotBias
-"""An error of a submap: a bias of its robot or of all sensors, of a marker, or in a saved map of
-one robot on the days of the map.
-"""
+"""An error of a submap: a bias, a marker's, or in a saved map one of a robot on its days."""
 DRIFT: Mapping[Bias, float] = MappingProxyType(
     {"forward_scale": 0.2, "range_offset": 0.1, "range_scale": 0.1}
 )
 """Scale of a robot's bias on another day about that of a saved map, in scales of its prior.
 
-Errors of ranges come from optics and electronics, which age over months; errors of the driven
-distance from tyres, load and floor. Clock offsets and bearings are not carried over: a clock is set
-at each start of its computer, and remounting turns a sensor by up to 0.3°, more than the prior's
-scale. The loss is that of Student's t, so a replaced sensor loses the tie.
+Clock offsets and bearings are not carried over: a clock is set at each start, and remounting turns
+a sensor by more than the prior's scale. By Student's t a replaced sensor loses the tie.
 """
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})
@@ -91,9 +85,8 @@ class Prior(NamedTuple):
 class Joined(NamedTuple):
     """A submap in the graph: its start, end and pose nodes, landmarks by id, biases; its factor.
 
-    biases: the error of each row of `sensitivity`, the team's last. sensitivity: ∂mean/∂b: a
-    robot's own error and the team's add up. A marker's row is that of the ranges' scale, for its
-    landmark alone.
+    biases: of the rows of `sensitivity`, ∂mean/∂b, the team's last. A marker's row is that of the
+    ranges' scale, for its landmark alone.
     """
 
     contribution: Contribution
@@ -110,8 +103,9 @@ class Joined(NamedTuple):
         own: tuple[Bias, ...],
         common: tuple[CommonError, ...],
     ) -> "Joined":
-        """Make a submap; its `common` errors, those of single robots in a saved map first, have a
-        node of the team. Raises NotACovarianceError that names the submap.
+        """Make a submap with errors of single robots in a saved map, its own, and the team's.
+
+        Raises NotACovarianceError.
         """
         biases = (*own, *common)
         rows = _sensitivity(contribution.local, biases)
@@ -184,12 +178,11 @@ class Graph:
     """The nodes in the order of their addition, and the factors between them.
 
     streams: start, then end pose of submap 0, 1, … of each stream. landmarks: node of each id.
-    poses: of each further pose, by (stream, stamp). biases, common: of each error that a stream's
-    submaps, or all streams, share; remembered: of each error of a robot on the days of a saved map.
-    offset: index in the state of each node's first number, and its length. fixed: exactly known
-    initial poses, the gauge. condensed: the quadratic that replaces older submaps (`condensing`);
-    gone: first sequence after them, at which `streams` begins. former: node of a moved landmark's
-    old place, by (saved map, id). memory: observations of condensed submaps.
+    poses: further poses by (stream, stamp). biases, common: errors that a stream's submaps, or all
+    streams, share. remembered: a robot's errors on the days of a saved map. former: old place of a
+    moved landmark, by (saved map, id). offset: of each node in the state, then its length. fixed:
+    exact initial poses, the gauge. condensed: the quadratic that replaces older submaps
+    (`condensing`). gone: first sequence after them. memory: their observations.
     """
 
     streams: Mapping[Stream, tuple[int, ...]]
@@ -210,7 +203,7 @@ class Graph:
 
     @cached_property
     def observed(self) -> tuple[Observed, ...]:
-        """Submaps for data association: stored condensed ones, then others."""
+        """Submaps for data association, stored condensed ones first."""
         own = (
             Observed(each.contribution.observation, each.landmarks, NO_COUNTS)
             for each in self.submaps
@@ -231,7 +224,7 @@ class Graph:
 
     @cached_property
     def pattern(self) -> core.Pattern:
-        """Blocks of the normal equations (a variable per node) and their places in the factor."""
+        """Blocks of the normal equations, a variable per node."""
         return self.factors.pattern
 
     @cached_property
@@ -400,10 +393,10 @@ def add_submaps(
 ) -> tuple[Graph, Values]:
     """Add submaps to a graph, in order.
 
-    A new end pose or pose node is start ∘ local pose; the first submap that observes a landmark
-    places it. A stream without an initial pose is fixed at (0, 0, 0), the gauge of its frame. A
-    bias has scale bias_sigma about 0 (without one the submap's biases are dropped), a common error
-    is N(0, common_bias_sigma²). numbers: the team's, of unnamed landmarks.
+    A new pose is start ∘ local pose; the first submap with a landmark places it. A stream without
+    an initial pose is fixed at (0, 0, 0), the gauge. A bias has scale bias_sigma about 0 (without
+    one the submap's biases are dropped), a common error is N(0, common_bias_sigma²). numbers: the
+    team's, of unnamed landmarks.
     """
     growth = _Growth(graph, state, bias_sigma)
     for contribution in (_drop_unscaled_biases(each, bias_sigma) for each in contributions):
@@ -474,10 +467,8 @@ def _drop_unscaled_biases(
 def _common_errors(
     contribution: Contribution, common_bias_sigma: Mapping[CommonBias, float]
 ) -> dict[CommonError, float]:
-    """Return the common errors of a submap with their sigmas.
-
-    Markers of unnamed landmarks are states of the full solution alone (`markers`); those of an
-    earlier day are part of a saved map's covariance.
+    """Return the common errors of a submap with their sigmas, without unnamed markers
+    (`markers`).
     """
     local = contribution.local
     found: dict[CommonError, float] = {
@@ -566,10 +557,8 @@ def append_nodes(
 def add_former_place(
     graph: Graph, state: Values, stream: Stream, id_: int, value: Values, *, shared: bool
 ) -> tuple[Graph, Values]:
-    """Separate a landmark's place in a saved map from its present one.
-
-    The map's factor gets a node at `value`; with no other observation (not `shared`) it keeps the
-    node, and there is no present landmark.
+    """Separate a landmark's place in a saved map, `value`, from its present one; without other
+    observations (not `shared`) there is no present one.
     """
     node = graph.landmarks[id_]
     if not shared:
@@ -587,7 +576,7 @@ def add_former_place(
 
 
 def pose_node(graph: Graph, robot: str, stamp_ns: int) -> int | None:
-    """Return the robot's pose node at this stamp, in its first incarnation with one."""
+    """Return the robot's pose node at a stamp."""
     incarnations = sorted(incarnation for name, incarnation in graph.streams if name == robot)
     found = (graph.poses.get(((robot, incarnation), stamp_ns)) for incarnation in incarnations)
     return next((node for node in found if node is not None), None)
@@ -622,7 +611,7 @@ def merge_graphs(
 ) -> tuple[Graph, Values]:
     """Join both graphs in the main frame; equal ids become one landmark, at the main graph's value.
 
-    The other frame's gauge becomes free, so none of its submaps may be condensed.
+    No submap of the other may be condensed, since its gauge becomes free.
     """
     assert other.condensed is None, "a condensed factor is linearised in its own frame"
     node_of = np.full(len(other.fixed), -1)
