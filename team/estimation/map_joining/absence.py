@@ -1,8 +1,8 @@
 """Expected observations of landmarks that robots have not observed.
 
-The probability p(d) to observe a landmark at distance d from a submap's path is estimated from the
-robots' own landmarks. A landmark at distances d_s is expected Σ p(d_s) times, with each p at most 1
-− `visibility.OVERLOOKED`, and missed by all submaps with probability Π (1 − p(d_s)).
+The probability p(d) ≤ 1 − `visibility.OVERLOOKED` to observe a landmark at distance d from a
+submap's path is estimated from the robots' own landmarks. A landmark at distances d_s is expected
+Σ p(d_s) times, and missed by all submaps with probability Π (1 − p(d_s)).
 """
 
 from collections.abc import Sequence

@@ -130,7 +130,7 @@ def _undo_closure(audit: Audit, after: Fold, share: float, settings: JoinSetting
 
 
 def share_now(fold: Fold, opened: Opened) -> float | None:
-    """Compute the matched share of the landmarks near a closure."""
+    """Compute the matched share of the landmarks near a closure; None without any."""
     places = {fold.landmarks.identity(one) for one, _ in opened.pairs}
     if not places:
         return None

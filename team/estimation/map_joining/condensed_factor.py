@@ -4,8 +4,8 @@ Linearised at the state `at` of condensing,
 
     cost(x) = cost + 2 slopeᵀ d + dᵀ information d,   d = x − at (headings wrapped),
 
-with the poses of no other factor eliminated (Schur complement): exact but for the linearisation
-point and the robust weights, which stay.
+with the poses of no other factor eliminated (Schur complement); the linearisation point and the
+robust weights stay.
 """
 
 from collections import Counter
@@ -79,10 +79,9 @@ class SubmapCosts:
 
 
 class EliminatedPath(NamedTuple):
-    """Eliminated poses of a stream, first to last, at the state of their elimination.
+    """Eliminated poses of a stream, first to last, as of their elimination.
 
-    blocks: runs of PATH_BLOCK poses, the last one shorter, stored once in checkpoints. is_fixed:
-    the first pose is a constant.
+    blocks: runs of PATH_BLOCK poses, which checkpoints share. is_fixed: the first is a constant.
     """
 
     blocks: tuple[Float[np.ndarray, "_ 3"], ...]
@@ -116,18 +115,12 @@ class Departed(NamedTuple):
 
 def select_newest(submaps: SubmapCosts) -> SubmapCosts:
     """Select the costs of the last HISTORY submaps of each stream."""
-    counts, older = Counter(submaps.streams), list[int]()
-    beyond = sum(max(count - HISTORY, 0) for count in counts.values())
+    left, newest = Counter(submaps.streams), list[int]()
     for place, stream in enumerate(submaps.streams):
-        if len(older) == beyond:
-            break
-        if counts[stream] > HISTORY:
-            counts[stream] -= 1
-            older.append(place)
-    streams = list(submaps.streams)
-    for place in reversed(older):
-        del streams[place]
-    return SubmapCosts(tuple(streams), np.delete(submaps.table, older, axis=1))
+        if left[stream] <= HISTORY:
+            newest.append(place)
+        left[stream] -= 1
+    return submaps.select(newest)
 
 
 NOBODY = Departed({}, SubmapCosts(), {}, {})
@@ -137,9 +130,8 @@ NOBODY = Departed({}, SubmapCosts(), {}, {})
 class Condensed:
     """The quadratic cost of the module's equation, over free nodes.
 
-    submaps: number of submaps that it replaces. redundancy: measured quantities less eliminated
-    unknowns. resting: ids of the landmarks at rest in the order of their places; None before the
-    first.
+    submaps: their number. redundancy: measured quantities less eliminated unknowns. resting: ids of
+    the landmarks at rest by place; None before the first.
     """
 
     factor: core.Quadratic

@@ -3,16 +3,16 @@
 The last `lag` submaps of each stream of the main island stay factors. Older ones become one
 quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`). A
 landmark without a raw submap comes to rest: it is eliminated, as a Gaussian given the other nodes,
-until a submap observes it again. The cost of a tick thus depends on the landmarks near the robots,
-not on the duration of the run.
+until a submap observes it again.
 
 No submap is condensed before the fold has `begin` submaps, before its robust scale is final, or in
 an unmerged island, whose frame will be transformed.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,6 @@ import numpy as np
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.map_joining.condensed_factor import (
-    NOBODY,
     Condensed,
     Departed,
     EliminatedPath,
@@ -60,9 +59,8 @@ LIMITS = Limits()
 def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     """Condense the old submaps of the fold's main island.
 
-    Submaps whose poses cannot be eliminated stay raw. A team with unnamed landmarks, which stay
-    nodes, condenses once it has as many submaps as landmarks; observations of condensed submaps are
-    stored (`memory`), and landmarks that few submaps confirm are dropped.
+    Unnamed landmarks stay nodes: with these a fold condenses once it has as many submaps as
+    landmarks, stores the observations (`memory`), and drops landmarks that few submaps confirm.
     """
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:
@@ -105,13 +103,10 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
 def _extend_memory(
     graph: Graph, leaving: Bool[np.ndarray, " F"], fold: Fold
 ) -> tuple[Memory, Indices]:
-    """Extend the graph's memory; return also the landmarks to drop: none during an audit, none
-    judged.
-    """
+    """Extend the graph's memory; return also the landmarks to drop, none during an audit."""
     counts, stays = np.zeros(len(graph.fixed), np.int64), np.zeros(len(graph.fixed), np.bool_)
-    before = {} if graph.condensed is None else graph.condensed.departed.believed
     for id_, node in graph.landmarks.items():
-        counts[node] = before.get(id_, 0)
+        counts[node] = graph.departed.believed.get(id_, 0)
     taken = []
     for submap, leaves in zip(graph.submaps, leaving.tolist(), strict=True):
         nodes = submap.landmarks
@@ -196,7 +191,7 @@ def _find_idle(
     graph: Graph, stays: Bool[np.ndarray, " F"], apart: Collection[int], first: int
 ) -> Indices:
     """List the nodes of landmarks that come to rest, ascending: in no raw submap and no other
-    island (`apart`), at least `first` at the first time.
+    island (`apart`); at first at least `first`.
     """
     seen = {*graph.landmark_nodes[np.repeat(stays, np.diff(graph.landmark_start))].tolist()}
     found = sorted(n for id_, n in graph.landmarks.items() if n not in seen and id_ not in apart)
@@ -223,8 +218,7 @@ def _sum_departed(
     given_up: Indices,
 ) -> Departed:
     graph = island.graph
-    before = NOBODY if graph.condensed is None else graph.condensed.departed
-    now = terms(island)
+    before, now = graph.departed, terms(island)
     believed = dict(before.believed)
     id_of = {node: id_ for id_, node in graph.landmarks.items()}
     is_believed = island.estimate.landmark_weights >= BELIEVED
@@ -244,9 +238,7 @@ def _paths(
     island: Island, before: Departed, leaving: Bool[np.ndarray, " F"]
 ) -> Mapping[Stream, EliminatedPath]:
     graph = island.graph
-    counts: dict[Stream, int] = defaultdict(int)
-    for f in np.flatnonzero(leaving):
-        counts[graph.submaps[f].contribution.stream] += 1
+    counts = Counter(each.contribution.stream for each in compress(graph.submaps, leaving))
     paths = dict(before.paths)
     for stream, count in counts.items():
         nodes = graph.streams[stream][:count]

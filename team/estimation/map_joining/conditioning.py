@@ -5,9 +5,9 @@ Williams 2001); the identity of two landmarks is an observation without noise. W
 relinearisation the map is overconfident after many joins.
 
 The pose in the team's map is the broadcast prior (joint marginal of the robot's last joined end
-pose and landmarks) times the later submaps, solved as at the centre (decision 21) and exact once
-the centre's estimates have corrected the shared errors of the submaps. A landmark observation that
-everything else contradicts is left out of it; no fused message contains this solution.
+pose and landmarks) times the later submaps, solved as at the centre (decision 21), with the
+centre's estimates of their shared errors. A landmark observation that everything else contradicts
+is left out; no fused message contains this solution.
 """
 
 import math
@@ -61,10 +61,7 @@ def _raise_fault(fault: int) -> None:
 
 
 GATE = 18.420680744107813
-"""99.99 % quantile of χ² of 2, `chi2_quantile(0.9999, 2)`, beyond which a submap's observation is
-attributed to another landmark. Some twenty are tested for each pose; leaving out a correct one
-costs little.
-"""
+"""`chi2_quantile(0.9999, 2)`, beyond which an observation is attributed to another landmark."""
 MAX_ITERATIONS, STEP_TOLERANCE = 50, 1e-6  # end of a solve, by number or largest change [m, rad]
 CONTRADICTED = 1e-6  # probability below which the cost of a prior and submaps is a contradiction
 FEWEST = 2  # number of rejected landmarks from which a submap as a whole is in doubt
@@ -72,9 +69,7 @@ NO_COVARIANCE = 2  # fault of the core: a map of the chain has no covariance
 
 
 class SubmapCorrection(NamedTuple):
-    """Corrections of a robot's submaps: covariance factor f, biases b (name,
-    estimate, deviation).
-    """
+    """Corrections of a robot's submaps: covariance factor f, biases b (name, estimate, sigma)."""
 
     covariance_factor: float = 1.0
     biases: tuple[tuple[Bias, float, float], ...] = ()
@@ -83,8 +78,7 @@ class SubmapCorrection(NamedTuple):
         """Correct a submap: N(mean + Σ (S b + ½ D b²), f P + S'ᵀ diag(σ²) S'), S' = S + b D, with
         sensitivity S and curvature D.
 
-        The uncertainty of b counts as independent of the map, which is conservative. A bias without
-        an estimate is zero.
+        The uncertainty of b counts as independent of the map. A bias without an estimate is zero.
         """
         if self.covariance_factor == 1.0 and not local.biases:
             return local
@@ -122,9 +116,9 @@ class RobotPrior(NamedTuple):
 class Followed(NamedTuple):
     """A robot's map after its later submaps, with their agreement.
 
-    known: number of each submap's landmarks in the map or another submap. refused: those that
-    everything else contradicts. cost: χ² of `dof` degrees of freedom, without these. disputed: that
-    χ² is too large, or most of a submap would be refused.
+    known: number of each submap's landmarks in the map or another submap. refused: those that the
+    rest contradicts. cost: χ² of `dof` degrees of freedom without these. disputed: it is too large,
+    or most of a submap would be refused.
     """
 
     whole: WholeMap
@@ -146,9 +140,9 @@ class Posed(NamedTuple):
 def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     """Join the submaps that follow the map's pose, in order, by least squares.
 
-    With a landmark beyond the gate, the landmarks are discounted as the gate narrows, and those
-    beyond it left out. If that is most of a submap, or the rest is contradictory, Cauchy's loss on
-    whole submaps and on the map finds the fault. Raises NotACovarianceError, NotDeterminedError.
+    Landmarks beyond the gate are left out. If that is most of a submap, or the rest is
+    contradictory, Cauchy's loss on whole submaps and on the map finds the fault. Raises
+    NotACovarianceError, NotDeterminedError.
     """
     submaps = [each.without_nodes for each in pending]
     if not submaps:
@@ -209,9 +203,9 @@ def remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMa
 def compose_pose(whole: WholeMap, open_window: WholeMap | None) -> Posed:
     """Compose a map's pose with the window in progress: N(pose, covariance) of the robot.
 
-    The map's marginal of the window's landmarks suffices. Landmarks whose constraints the others
-    contradict by more than GATE are left out, worst first: T = zₗᵀ ((S⁻¹)ₗₗ)⁻¹ zₗ with z = S⁻¹ y is
-    χ² of two degrees of freedom (Baarda). Raises NotACovarianceError.
+    Landmarks that the others contradict by more than GATE are left out, worst first: T = zₗᵀ
+    ((S⁻¹)ₗₗ)⁻¹ zₗ with z = S⁻¹ y is χ² of two degrees of freedom (Baarda). Raises
+    NotACovarianceError.
     """
     if open_window is None:
         return Posed(PoseGaussian(*whole.pose()))

@@ -1,7 +1,7 @@
 """Seams: places where a robot's view changes at once although its odometry measures no motion.
 
-Where a robot is carried off or its odometry slips by metres, the landmarks before and after
-differ. The log-likelihood ratio of a displaced robot against one that overlooks landmarks is
+The log-likelihood ratio of a robot that was carried off or slipped against one that overlooks
+landmarks is
 
   ABSENT · (landmarks absent on the other side) − PRESENT · (landmarks that may be there).
 
@@ -39,7 +39,7 @@ class Seam(NamedTuple):
     """A place at which a stream is cut.
 
     before, after: last submap before and first after it; one between is spoilt. begin_ns, end_ns:
-    end of the former, beginning of the latter. evidence: log-likelihood ratio.
+    end of the former, beginning of the latter.
     """
 
     stream: Stream

@@ -1,10 +1,10 @@
 """Landmarks that a final map leaves out, and streams that are lost or tied by odometry alone.
 
 A robot that is carried off, or whose odometry slips by metres, maps landmarks twice without a
-contradiction, since only odometry connects its later submaps with the rest. For each boundary
-between submaps beyond which a stream observes hardly any landmark of the rest, the n landmarks
-first observed beyond it are aligned with the N others, in an area A, by a rigid motion (`voting`).
-The expected number of motions that match m or more within r by chance is
+contradiction. For each boundary between submaps beyond which a stream observes hardly any landmark
+of the rest, the n landmarks first observed beyond it are aligned with the N others, in an area A,
+by a rigid motion (`voting`). The expected number of motions that match m or more within r by chance
+is
 
   E = n(n − 1) N(N − 1) P(X ≥ m − 2),   X ~ binomial(n − 2, min(1, π r² N/A))
 
@@ -59,11 +59,11 @@ LEAST_SCALE = 0.1  # least scale of residuals: data without noise have none
 
 
 def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
-    """Find the unnamed landmarks with which fewer than `least` submaps agree, ascending.
+    """Find the unnamed landmarks with which fewer than `least` submaps agree, ascending, except for
+    those of a saved map or judged by an operator.
 
     A submap agrees if its χ² is below `landmark_gate` · min(1, median of the map's χ² / (2 ln 2)):
-    covariances stated too large must not admit a neighbour. Landmarks of a saved map or judged by
-    an operator are left out.
+    covariances stated too large must not admit a neighbour.
     """
     island = fold.main
     graph, settings = island.graph, island.settings
@@ -85,18 +85,16 @@ def find_disagreeing(fold: Fold, ids: Collection[int], least: int) -> list[int]:
 
 
 def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
-    """Find the landmarks of the main island that nearly all submaps with a view of them miss, by
-    id.
+    """Find the landmarks that nearly all submaps with a view of them miss, ascending, except those
+    judged by an operator.
 
     A landmark of n < MOST submaps is missed if each landmark of MOST or more submaps beside it was
-    observed by MOST n, and at least half of its submaps have one beside it. Saved maps do not
-    count; landmarks judged by an operator are left out.
+    observed by MOST n, and at least half of its submaps have one beside it.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)
-    before = {} if graph.condensed is None else graph.condensed.departed.believed
     for id_, node in graph.landmarks.items():
-        counts[node] = before.get(id_, 0)
+        counts[node] = graph.departed.believed.get(id_, 0)
     for submap in graph.submaps:
         counts[submap.landmarks[submap.landmarks >= 0]] += 1
     observed = np.full(len(counts), np.iinfo(np.int64).max)
@@ -142,10 +140,10 @@ LEAST_TIED = 2  # least number of landmarks on either side of a place that odome
 
 
 class OdometryTie(NamedTuple):
-    """A place in a stream that no landmark spans: none is both after it and elsewhere.
+    """A place in a stream that no landmark spans.
 
-    first: submap after it. earlier, later: numbers of landmarks. begin_ns, end_ns: of the part
-    after it. sigmas: of its start's position [m] and heading [rad].
+    first: submap after it. earlier, later: numbers of landmarks. begin_ns, end_ns: of the later
+    part. sigmas: of its start's position [m] and heading [rad].
     """
 
     stream: Stream
@@ -160,10 +158,8 @@ class OdometryTie(NamedTuple):
 def find_odometry_ties(
     island: Island, shown: Collection[int], undecided: Collection[int] = ()
 ) -> list[OdometryTie]:
-    """Find each stream's odometry tie with the most evidence of missed landmarks (`late_seams`).
-
-    It has a shown landmark on both sides, and at least MOST_ABSENT of evidence; with less, the
-    covariance of the odometry there is valid.
+    """Find each stream's odometry tie with the most evidence of missed landmarks (`late_seams`), at
+    least MOST_ABSENT, and a shown landmark on both sides.
     """
     unnamed = sorted(node for id_, node in island.graph.landmarks.items() if id_ >= UNNAMED)
     sees = _tabulate(island, unnamed)
@@ -229,8 +225,8 @@ class Repetition(NamedTuple):
     """Landmarks of a stream's submaps from `first` on that repeat others after a motion.
 
     ids: landmarks of these submaps alone; pairs: those that match. begin_ns, end_ns: of these
-    submaps. place: of the boundary (x, y) [m]; displacement: its move (x, y) [m] and turn [rad]
-    that would make each pair one landmark.
+    submaps. place: of the boundary [m]; displacement (x, y) [m] and turn [rad] that would make each
+    pair one landmark.
     """
 
     stream: Stream

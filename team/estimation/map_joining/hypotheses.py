@@ -5,12 +5,9 @@ two submaps. Its evidence is the cost that they remove,
 
   e = min_x cost(x) − min_{x, θ} cost(x, θ),
 
-χ² with dim θ degrees of freedom without a fault; both minima have the robust loss. A scan of single
-submaps proposes hypotheses, which are solved at the final robust scales. The best by evidence per
-degree of freedom stays in the graph while the others are tested again.
-
-For real data, the evidence is divided by the covariance scale of the other submaps, and an effect
-must exceed the resolution of a single submap.
+with the robust loss: without a fault χ² of dim θ degrees of freedom, times the covariance scale. A
+scan of single submaps proposes hypotheses. The best by evidence per degree of freedom stays in the
+graph while the others are tested again.
 """
 
 import math
@@ -42,7 +39,7 @@ Costs = Float[np.ndarray, "..."]
 Places = Int64[np.ndarray, " n"]
 Covariance = Float[np.ndarray, "k k"]
 
-CHANCE = 1e-3  # probability that chance gives a hypothesis of any landmark or seam enough evidence
+CHANCE = 1e-3  # probability that chance gives any hypothesis enough evidence
 SplitCause = Literal["landmark_moved", "identity_shared", "carried_off"]
 MOVED: Final = "landmark_moved"
 SHARED: Final = "identity_shared"
@@ -128,12 +125,9 @@ class _Two(NamedTuple):
 def _chi2_about(
     sights: Sights, point: Float[np.ndarray, "*k 2"], own: slice | Bool[np.ndarray, " n"] = ALL
 ) -> Costs:
-    return _chi2_of(sights.points[own] - point, sights.spread[own])
-
-
-def _chi2_of(away: Float[np.ndarray, "*k n 2"], spread: Float[np.ndarray, "n 3"]) -> Costs:
+    away = sights.points[own] - point
     x, y = away[..., 0], away[..., 1]
-    xx, xy, yy = spread.T
+    xx, xy, yy = sights.spread[own].T
     chi2: Costs = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
     bounded: Costs = np.minimum(chi2, FAR)
     return bounded
@@ -155,8 +149,8 @@ def _least_side(n: int) -> int:
 
 
 def _is_shared(sights: Sights, second: Bool[np.ndarray, " n"]) -> bool:
-    """Return whether both places have enough observations: a share of STRAY, or two that agree and
-    are most of those elsewhere.
+    """Return whether both places have a share of STRAY, or two observations that agree and are most
+    of those elsewhere.
     """
     few = _less_frequent(second)
     count = int(few.sum())
@@ -182,8 +176,7 @@ def _price(second: Bool[np.ndarray, " n"]) -> float:
 
 def _split_by(sights: Sights, second: Bool[np.ndarray, " n"], price: float) -> _Two:
     """χ² about one place, less χ² about two and the price of the choice."""
-    everything = np.ones(len(second), np.bool_)
-    one = float(_chi2_about(sights, _centre(sights, everything)).sum())
+    one = float(_chi2_about(sights, median(sights.points)).sum())
     parts = (
         float(_chi2_about(sights, _centre(sights, own))[own].sum()) for own in (~second, second)
     )
@@ -317,10 +310,9 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
 
 
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
-    """Solve the hypotheses of a jump beside a submap that disagrees with the rest.
-
-    Leaving out the submap comes first, since a jump removes no more cost. Before a first submap a
-    jump is an error of the initial pose.
+    """Solve the hypotheses of a jump beside a submap that disagrees with the rest, without the
+    submap first, since a jump removes no more cost. Before a first submap it is an error of the
+    initial pose.
     """
     island, graph = base.island, base.island.graph
     costs = terms(island).submaps
@@ -334,7 +326,6 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         robot, stamp = joined.contribution.robot, joined.contribution.end_ns
         own = joined.contribution.local
         begin, finish = island.value(start), island.value(end)
-        back = compose(finish, inverse(own.end_pose))
         new = len(graph.fixed)
         before = _begin_ns(island, at)
         dropped = resolved(without(island, [at]))
@@ -343,6 +334,7 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
             at_end = split(island, end, {at}, compose(begin, own.end_pose))
             trials.append((resolved(at_end), stamp, POSE))
             if before or _is_known_start(graph, at):
+                back = compose(finish, inverse(own.end_pose))
                 trials.append((resolved(split(island, start, {at}, back)), before, POSE))
         for k, (found, when, dof) in enumerate(trials):
             if found is None:
@@ -378,9 +370,8 @@ def _is_known_start(graph: Graph, place: int) -> bool:
 def motion_beyond(
     island: Island, start: int, end: int, motion: Pose, covariance: Covariance
 ) -> tuple[Values, Covariance]:
-    """Return the motion between two poses less a measured one, in the map's frame.
-
-    motion, covariance: of the end pose in the frame of the start.
+    """Return the motion between two poses less a measured one N(motion, covariance), which is in
+    the frame of the start, in the map's frame.
     """
     mean, P = joint_marginal(island, [start, end])
     predicted = compose(mean[:3], motion)
@@ -396,9 +387,8 @@ def motion_beyond(
 
 
 def _spoilt_by_identity(base: _Solved, _level: float) -> Iterator[Hypothesis]:
-    """Propose that one number of two landmarks spoils submaps that observed both.
-
-    Most of these submaps have that landmark worst, between its two places, and a bent path.
+    """Propose that one number of two landmarks spoils submaps that observed both: most have that
+    landmark worst, between its two places.
     """
     island, graph = base.island, base.island.graph
     chi2 = graph.factors.landmark_chi2(island.state, island.settings.covariance_factor)
@@ -474,9 +464,8 @@ def explain(island: Island) -> tuple[list[Hypothesis], Island]:
 def _told_apart(accepted: list[Hypothesis], base: _Solved, level: float) -> list[Hypothesis]:
     """Drop repetitions, and the apparent effects of another fault.
 
-    One number of two landmarks bends paths, which is no jump. Jumps at several places without a
-    sound submap beside one are wild measurements of the robot, as is a second place that it alone
-    observes.
+    One number of two landmarks bends paths. Jumps at several places without a sound submap beside
+    one are wild measurements, as is a second place that this robot alone observes.
     """
     jumps = [each.subject for each in accepted if each.cause == CARRIED_OFF]
     wild = {

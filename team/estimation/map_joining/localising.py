@@ -51,7 +51,7 @@ def locate_robot(
     undetermined.
 
     own: the robot's map; window: the open one; covariance_factor: on both. If the landmarks
-    disagree, the largest set of one rigid motion is used, provided that it is most of them. Raises
+    disagree, the largest set of one rigid motion is used where it is most of them. Raises
     NotACovarianceError, NotDeterminedError.
     """
     whole = own if window is None else join_submap(own, window.named)

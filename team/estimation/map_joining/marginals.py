@@ -13,7 +13,7 @@ from teamslam.team.config import UNNAMED, Bias
 from teamslam.team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE, deviation
-from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, SubmapCosts
+from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal, solve_island
 from teamslam.team.estimation.map_joining.joining import Fold
@@ -202,8 +202,7 @@ def confirmed(fold: Fold, submaps: int, unnamed: int = 1) -> list[int]:
         nodes[island.estimate.landmark_weights >= BELIEVED], return_counts=True
     )
     count_of = dict(zip(found.tolist(), counts.tolist(), strict=True))
-    old = island.graph.condensed
-    before = {} if old is None else old.departed.believed
+    before = island.graph.departed.believed
     graph, node_of = island.graph, island.graph.landmarks
     maps = (graph.submaps[k].landmarks.tolist() for k in graph.saved_maps.tolist())
     saved = {node for each in maps for node in each}
@@ -435,16 +434,12 @@ def with_unbounded_costs(agreement: Agreement, fold: Fold) -> Agreement:
 
 def joint_cost(fold: Fold) -> Agreement:
     """Evaluate the agreement of the main island's submaps, condensed ones as of condensing."""
-    found = terms(fold.main)
-    old = fold.main.graph.condensed
-    departed = NOBODY if old is None else old.departed
-    robots = found.add_to(departed.robots)
-    chi2 = sum(robots[robot][0] for robot in sorted(robots))
-    total = sum(robots[robot][1] for robot in sorted(robots))
+    found, departed = terms(fold.main), fold.main.graph.departed
+    robots = dict(sorted(found.add_to(departed.robots).items()))
     return Agreement(
-        chi2,
-        total,
-        {robot: robots[robot] for robot in sorted(robots)},
+        sum(chi2 for chi2, _ in robots.values()),
+        sum(dof for _, dof in robots.values()),
+        robots,
         departed.submaps.followed_by(found.submaps),
         tuple(_sighting_costs(fold.main)),
     )
@@ -459,7 +454,6 @@ def _own_marginal(
 
 
 def _sighting_costs(island: Island) -> list[SightingCost]:
-    seen = zip(island.graph.sightings, island.estimate.sighting_chi2.tolist(), strict=True)
-    costs = [(each.sighting, chi2) for each, chi2 in seen]
-    costs.sort(key=lambda each: each[0].key)
-    return [SightingCost(of.robot, of.teammate, chi2) for of, chi2 in costs]
+    costs = zip(island.graph.sightings, island.estimate.sighting_chi2.tolist(), strict=True)
+    in_order = sorted(costs, key=lambda each: each[0].sighting.key)
+    return [SightingCost(of.sighting.robot, of.sighting.teammate, chi2) for of, chi2 in in_order]

@@ -2,8 +2,7 @@
 
 Starts are the places that the shared points propose (all, the landmarks alone, the inter-robot
 measurements alone, every heading at which they fit well), and one independent of them (`minima`).
-The full solution of lowest cost is accepted if the maps agree and no other place is about as
-likely.
+The lowest full solution is accepted if the maps agree and no other place is about as likely.
 
 A shared point is a landmark of both, or a teammate observed from a pose node: at pose ∘ (range,
 bearing) in the observer's island, at its pose node in its own.
@@ -192,11 +191,7 @@ class Waits(NamedTuple):
 
 
 def merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> Merge | Waits:
-    """Merge the other island into the main one's frame, or return the reason to wait.
-
-    Waits also without a solution, and while the other island has condensed submaps, whose frame is
-    fixed.
-    """
+    """Merge the other island into the main one's frame, or return the reason to wait."""
     if other.graph.condensed is not None:
         return Waits("its submaps are condensed in a frame of their own", after_search=False)
     try:

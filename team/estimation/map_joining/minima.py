@@ -1,8 +1,7 @@
 """Search for the lowest minimum: one island solved from several starts.
 
-After a long path without landmarks Gauss-Newton may fold a chain wrongly. A cost far above its
-degrees of freedom, or a lower end of another start, reveals it. A second minimum of similar cost is
-a second map of the same submaps.
+After a long path without landmarks Gauss-Newton may fold a chain wrongly, which a cost far above
+its degrees of freedom or a lower end of another start reveals.
 """
 
 import math
@@ -80,10 +79,9 @@ def likely_rise() -> float:
 
 def search_minima(starts: Sequence[Island]) -> Search:
     """Find the lowest minimum from several starts of one graph, and from the relaxation of its
-    headings.
+    headings; while the cost is suspicious, or with few landmarks, from `_make_starts`.
 
-    While the cost is suspicious, or with few landmarks, starts without inter-robot measurements and
-    with wide robust scales are tried too. Raises NotDeterminedError if no start has a solution.
+    Raises NotDeterminedError if no start has a solution.
     """
     few = len(starts[0].graph.landmarks) <= FEW_LANDMARKS
     found = list(_solve_each(starts))
@@ -106,10 +104,8 @@ def _solve_each(starts: Iterable[Island]) -> Iterator[Minimum]:
 
 
 def widen_search(search: Search) -> Search:
-    """Extend the search by the minima next to the best one, for maps with few landmarks.
-
-    Each uncertain heading of a first or last pose is displaced as far as is likely, and each stream
-    is mirrored at the line through two landmarks.
+    """Extend the search by the minima next to the best one, for maps with few landmarks: each
+    uncertain heading of a first or last pose is displaced, and each stream mirrored.
     """
     best = search.best.island
     if len(best.graph.landmarks) > FEW_LANDMARKS:
@@ -167,7 +163,9 @@ def _select_lowest(found: Sequence[Minimum]) -> Search:
 
 
 def _make_starts(island: Island) -> Iterator[Island]:
-    """Make starts independent of the state, most promising first; none with condensed submaps."""
+    """Make starts independent of the state: relaxed, without inter-robot measurements, and with
+    wide robust scales; none with condensed submaps.
+    """
     graph = island.graph
     if graph.condensed is not None:
         return
@@ -201,8 +199,9 @@ def is_another_minimum(one: Minimum, best: Minimum) -> bool:
     """Return whether a minimum is another map: dᵀAd, the rise that the best one's covariance
     predicts for the difference d, exceeds `likely_rise`.
     """
+    values, _ = best.island.estimate.normal_equations
     difference = _difference(one.island, best.island)
-    return _quadratic(best.island, difference) > likely_rise()
+    return best.island.graph.pattern.quadratic(values, difference) > likely_rise()
 
 
 def _difference(one: Island, other: Island) -> Values:
@@ -210,11 +209,6 @@ def _difference(one: Island, other: Island) -> Values:
     headings = one.graph.headings
     difference[headings] = wrapped(difference[headings])
     return difference
-
-
-def _quadratic(island: Island, x: Values) -> float:
-    values, _ = island.estimate.normal_equations
-    return island.graph.pattern.quadratic(values, x)
 
 
 def rival_distance(search: Search) -> float | None:
@@ -251,8 +245,8 @@ def warnings(search: Search) -> list[str]:
         f"{named(stream)} is placed weakly: its heading is known to {np.degrees(sigma):.0f}° at "
         f"best, {np.degrees(limit):.0f}° needed; the map may be bent by more than its covariance "
         "allows"
-        for stream, sigma in sorted(_heading_sigmas(island).items())
-        if sigma > limit
+        for stream, nodes in sorted(island.graph.streams.items())
+        if (sigma := min(heading_sigma(island, node) for node in nodes)) > limit
     ]
     with suppress(*UNSOLVABLE):  # a heading that cannot be moved bends nothing
         found += nonlinearity_warnings(island)
@@ -262,10 +256,3 @@ def warnings(search: Search) -> list[str]:
             f"up to {farthest:.1f} m away"
         )
     return found
-
-
-def _heading_sigmas(island: Island) -> dict[Stream, float]:
-    return {
-        stream: min(heading_sigma(island, node) for node in nodes)
-        for stream, nodes in island.graph.streams.items()
-    }

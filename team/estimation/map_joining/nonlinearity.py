@@ -1,8 +1,7 @@
 """Detect a pose covariance that understates the uncertainty: a curved valley of the cost.
 
 One heading is displaced and everything else solved given it: the profile of the cost (Bates & Watts
-1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement; after a long path
-without landmarks that χ² may be ten times the rise.
+1988, chapter 6). For a quadratic cost its rise is the χ² of the displacement.
 """
 
 from collections.abc import Iterator
@@ -25,17 +24,10 @@ from teamslam.team.estimation.se2 import compose, inverse, logarithm
 
 STEPS = (1.0, 2.0, 3.0)  # displacements of a heading, in its standard deviations
 ITERATIONS = 4
-SHORTEST = 0.01
-"""Squared length, in standard deviations, of the last step; shorter ones change the reported rises
-by less than a tenth.
-"""
-STRAIGHT_RAD = 0.1
-"""Standard deviation [rad] of a heading below which the cost is taken as quadratic."""
-BENT = 4.0
-"""Reported ratio of χ² by the covariance to the rise of the cost: the ellipse is too short by half.
-"""
-UNLIKELY = 10.8275661707
-"""Rise of the cost beyond which a place is not considered: `chi2_limit(1, 1e-3)`."""
+SHORTEST = 0.01  # squared length, in standard deviations, of the last step
+STRAIGHT_RAD = 0.1  # deviation [rad] of a heading below which the cost is taken as quadratic
+BENT = 4.0  # reported ratio of χ² to the rise of the cost: the ellipse is too short by half
+UNLIKELY = 10.8275661707  # rise of the cost of an unlikely place: `chi2_limit(1, 1e-3)`
 
 
 class UnderstatedUncertainty(NamedTuple):

@@ -1,9 +1,9 @@
 """Add the members of a tick to a fold; refuse those that allow no solution, with a reason.
 
 If a tick as a whole has no solution, its members are added in canonical order without those that
-make the normal equations unsolvable (law 2). A refused submap is reduced to its motion, the
-marginal of its end pose; where that fails too, the robot's chain ends. An unsolvable initial pose
-becomes unknown; an inter-robot measurement is left out.
+make the normal equations unsolvable. A refused submap is reduced to its motion; where that fails
+too, the robot's chain ends. An unsolvable initial pose becomes unknown; an inter-robot measurement
+is left out.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

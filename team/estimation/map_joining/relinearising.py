@@ -1,8 +1,7 @@
 """Restore condensed submaps at a few sizes of the fold, and where a tick contradicts them.
 
 Submaps linearised at different headings make the map overconfident. At begin · GROWTH^k submaps, up
-to SETTLED, and at a tick that moves them beyond their linearisation, all condensed submaps are
-restored, solved, and condensed anew.
+to SETTLED, and at a tick that moves them beyond their linearisation, all are restored and solved.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,10 +50,8 @@ def is_due(before: int, after: int, begin: int = LIMITS.begin) -> bool:
 
 
 def is_contradicted(before: Fold, after: Fold) -> bool:
-    """Return whether a tick changes the condensed submaps beyond their linearisation.
-
-    This holds for a closure, the first unnamed landmarks, and a new main island, into whose frame
-    the former one will be transformed.
+    """Return whether a tick moves the condensed submaps beyond their linearisation: by a closure,
+    the first unnamed landmarks, or a new main island.
     """
     begins = after.has_unnamed and not before.has_unnamed
     return bool(after.landmarks.opened) or begins or before.main_key != after.main_key

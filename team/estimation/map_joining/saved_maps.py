@@ -1,15 +1,15 @@
 """Saved maps of earlier days in an island: tests of their landmarks, and landmarks that moved.
 
-A saved map is a Gaussian over its landmarks in a free frame. A displacement e of landmark i from
-its place in it lowers the joint cost by
+A saved map is a Gaussian over its landmarks in a free frame. A displacement e of landmark i lowers
+the joint cost by
 
     χ²_i = g_iᵀ M_ii⁻¹ g_i,   g = W r,   M = W − W J Σ Jᵀ W,
 
 with the map's residual r, information W and Jacobian J, and the island's covariance Σ; e = M_ii⁻¹
 g_i with covariance M_ii⁻¹ (Baarda 1968). Without a displacement χ²_i has two degrees of freedom. A
-landmark beyond the limit gets a second node, its former place, which the map alone observes; the
-others are tested again, the worst first. A submap may associate an unnamed landmark with its
-neighbour, so two submaps are needed to move it, and the association of one is undone.
+landmark beyond the limit gets a second node, its former place, which the map alone observes. Two
+submaps are needed to move an unnamed one, since one may have associated its neighbour, which is
+undone.
 """
 
 from collections.abc import Collection, Iterable, Sequence
@@ -225,7 +225,7 @@ def next_change(
 ) -> tuple[Joined, Displacement] | None:
     """Find the landmark that disagrees most with its place in a saved map, beyond chance.
 
-    nodes: those to test in a running map, in which an unnamed landmark needs a second submap.
+    nodes: those to test in a running map.
     """
     limit, graph = chi2_limit(2, chance), island.graph
     found = [
@@ -297,9 +297,8 @@ def contradiction(island: Island) -> tuple[Stream, str] | None:
 def disagreeing(
     main: Island, other: Island, ids: Sequence[int], confidence: float
 ) -> list[int] | str:
-    """Find the landmarks that moved between two islands, one with a saved map.
-
-    Returns the reason if no more than half agree within `confidence`.
+    """Find the landmarks that moved between two islands, one with a saved map, or return the reason
+    if no more than half agree within `confidence`.
     """
     a, A = joint_marginal(main, [main.graph.landmarks[id_] for id_ in ids])
     b, B = joint_marginal(other, [other.graph.landmarks[id_] for id_ in ids])

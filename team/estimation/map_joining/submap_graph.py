@@ -26,7 +26,7 @@ from teamslam.team.estimation.contribution import (
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.condensed_factor import Condensed
+from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, Condensed, Departed
 from teamslam.team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.estimation.submap import LocalMap
@@ -260,6 +260,11 @@ class Graph:
     def first_sequence(self, stream: Stream) -> int:
         """Return the sequence number of a stream's first raw submap."""
         return self.gone.get(stream, first_of(stream))
+
+    @property
+    def departed(self) -> Departed:
+        """Statistics of the condensed factors."""
+        return NOBODY if self.condensed is None else self.condensed.departed
 
     @property
     def size(self) -> int:
