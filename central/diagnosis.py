@@ -22,7 +22,7 @@ from teamslam.team.config import MAP, UNNAMED
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Contribution, Stream, moment, named, part_of
 from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, information
-from teamslam.team.estimation.map_joining import hypotheses, marginals, saved_maps
+from teamslam.team.estimation.map_joining import hypotheses, marginals
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.se2 import Pose, compose, wrapped
@@ -185,7 +185,8 @@ def doubt_signs(found: Sequence[m.Diagnosis]) -> list[m.Diagnosis]:
 
 def _landmarks_of_saved_maps(fold: Fold) -> set[int | str]:
     """List the landmarks that may have moved since a saved map: the final map lists the changes."""
-    maps = (each.contribution.local for each in saved_maps.maps_of(fold.main.graph))
+    graph = fold.main.graph
+    maps = (graph.submaps[k].contribution.local for k in graph.saved_maps.tolist())
     return {id_ for each in maps for id_ in each.ids.tolist()}
 
 

@@ -23,7 +23,7 @@ from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from teamslam.team.estimation.map_joining.minima import MISFIT, RIVAL
-from teamslam.team.estimation.map_joining.refusal import describe_refusals
+from teamslam.team.estimation.map_joining.tick import describe_refusals
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids

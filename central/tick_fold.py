@@ -32,7 +32,6 @@ from teamslam.team.config import BIASES, MAP
 from teamslam.team.estimation import contribution
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.map_joining import joining, marginals
-from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.fold_association import recognise_moved
@@ -41,6 +40,7 @@ from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
 from teamslam.team.estimation.map_joining.saved_maps import contradiction
 from teamslam.team.estimation.map_joining.submap_graph import CommonBias
+from teamslam.team.estimation.map_joining.tick import fold_tick
 from teamslam.team.wire.messages import SightingFactor, Submap
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")

@@ -17,7 +17,6 @@ from teamslam.team import translate
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Window
-from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -28,6 +27,7 @@ from teamslam.team.estimation.map_joining.joining import (
     fold_submaps,
     solve_fold,
 )
+from teamslam.team.estimation.map_joining.tick import fold_tick
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import messages as m

@@ -9,7 +9,7 @@ from teamslam.central.checkpoints import NEAR, Checkpoint, thinned
 from teamslam.central.config import CentralConfig
 from teamslam.central.tick_fold import TickFold
 from teamslam.team import translate
-from teamslam.team.estimation.map_joining import landmark_view, marginals, refusal
+from teamslam.team.estimation.map_joining import landmark_view, marginals, tick
 from teamslam.team.estimation.map_joining.condensing import Limits
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD
 from teamslam.team.wire.arrays import floats, from_floats
@@ -142,7 +142,7 @@ def test_a_refused_submap_is_not_restored(monkeypatch):
 def test_a_submap_with_its_motion_alone_is_restored_so(monkeypatch):
     """With the landmarks of r2's submap 5 no graph counts as solvable."""
     members = SUBMAPS.every()
-    solvable = refusal.is_solvable
+    solvable = tick.is_solvable
 
     def strict(island):
         chosen = (each.contribution for each in island.graph.submaps)
@@ -150,7 +150,7 @@ def test_a_submap_with_its_motion_alone_is_restored_so(monkeypatch):
             (each.robot, each.sequence) == ("r2", 5) and len(each.local.ids) for each in chosen
         )
 
-    monkeypatch.setattr(refusal, "is_solvable", strict)
+    monkeypatch.setattr(tick, "is_solvable", strict)
     bounded, full = fresh(), fresh(bounded=False)
     for each in members:
         add(bounded, each)

@@ -7,7 +7,7 @@ from teamslam.central.tick_fold import TickFold
 from teamslam.team import translate
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import UNNAMED
-from teamslam.team.estimation.map_joining import auditing, condensing, marginals
+from teamslam.team.estimation.map_joining import condensing, marginals, tick
 from teamslam.team.estimation.map_joining.condensing import Limits
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from teamslam.team.wire.codec import encoded
@@ -130,7 +130,7 @@ def test_a_closure_of_what_is_condensed_is_solved_with_all_of_it_linearised_agai
     sizes = []
 
     def noted(fold, *rest):
-        after = auditing.fold_tick(fold, *rest)
+        after = tick.fold_tick(fold, *rest)
         if after.landmarks.opened:
             sizes.append((fold.condensed_count, after.condensed_count))
         return after

@@ -128,9 +128,9 @@ class Fold:
     submaps of two islands at their last failed merge, and its reason; ambiguous: where several
     alignments passed; searched_at: at an island's last failed search for a lower minimum.
     iterations, change: of the main island's last full solution [m, rad]. refused: submaps not in
-    the map, with the reason (`refusal`); motion_only: those with their motion in the map; left_out:
+    the map, with the reason (`tick`); motion_only: those with their motion in the map; left_out:
     inter-robot measurements without a solution; set_aside: other refusals. audits: closures that
-    may be undone (`auditing`). cuts: seams that cut a stream (`continuity`).
+    may be undone (`tick`). cuts: seams that cut a stream (`continuity`).
     """
 
     contributions: tuple[Contribution, ...]

@@ -12,7 +12,6 @@ import numpy as np
 from teamslam.team.estimation.contribution import Contribution, Key, Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.auditing import cut_members
 from teamslam.team.estimation.map_joining.condensed_factor import EliminatedPath
 from teamslam.team.estimation.map_joining.condensing import LIMITS
 from teamslam.team.estimation.map_joining.gauss_newton import (
@@ -29,6 +28,7 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.landmark_view import known, points_of
 from teamslam.team.estimation.map_joining.saved_maps import maps_of, separate
 from teamslam.team.estimation.map_joining.submap_graph import NO_NUMBERS
+from teamslam.team.estimation.map_joining.tick import cut_members
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.shapes import Float
 

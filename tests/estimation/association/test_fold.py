@@ -7,7 +7,6 @@ from teamslam.central.join_messages import Shown, reasons
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.association.landmark_sets import OPEN, Opened, Verdict
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.auditing import fold_tick, share_now
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -15,6 +14,7 @@ from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
     Tick,
 )
+from teamslam.team.estimation.map_joining.tick import fold_tick, share_now
 from tests.estimation.association.unnamed_worlds import circle, drive, duplicates, wrong
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))

@@ -23,7 +23,6 @@ from teamslam.team.estimation.association.landmark_sets import (
 )
 from teamslam.team.estimation.association.member_log import MergeRecord
 from teamslam.team.estimation.association.voting import PointSet, apply_motion, propose_alignments
-from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.fold_association import view_island
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
@@ -31,6 +30,7 @@ from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
     Tick,
 )
+from teamslam.team.estimation.map_joining.tick import fold_tick
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.association.unnamed_worlds import circle, drive
 

@@ -10,7 +10,6 @@ from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.association.member_log import LocalLandmark
 from teamslam.team.estimation.contribution import Contribution
-from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
@@ -19,6 +18,7 @@ from teamslam.team.estimation.map_joining.joining import (
     Tick,
     add_start,
 )
+from teamslam.team.estimation.map_joining.tick import fold_tick
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 from tests.estimation.association.unnamed_worlds import circle, drive

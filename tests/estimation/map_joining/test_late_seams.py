@@ -12,11 +12,11 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.contribution import Contribution
-from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.distinctness import find_odometry_ties, find_parts
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
 from teamslam.team.estimation.map_joining.late_seams import find_late_seam
+from teamslam.team.estimation.map_joining.tick import fold_tick
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from tests.estimation.association.unnamed_worlds import circle, drive

@@ -8,13 +8,13 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.join_messages import reasons, shown_landmarks
 from teamslam.team.association import AssociationProfile
 from teamslam.team.estimation.contribution import Contribution
-from teamslam.team.estimation.map_joining.auditing import fold_tick
 from teamslam.team.estimation.map_joining.distinctness import (
     BY_CHANCE,
     find_repetitions,
     log_by_chance,
 )
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold, JoinSettings, Tick
+from teamslam.team.estimation.map_joining.tick import fold_tick
 from tests.estimation.association.unnamed_worlds import circle, drive
 
 SETTINGS = JoinSettings(association=AssociationProfile(recent=4))
