@@ -35,11 +35,10 @@ Spoilt = Mapping[Seam, Sequence[Contribution]]
 NO_SPOILT: Spoilt = MappingProxyType({})
 SIGMAS = 4.0  # least size of a shared error in its standard deviations
 NONLINEAR = 0.08
-"""Standard deviation of a shared error's estimate as a share of it. The submaps' sensitivities are
-a smoother's; the mean of 100 particles answers errors by a few per cent more.
+"""Standard deviation of a shared error's estimate as a share of it: sensitivities are a smoother's,
+the mean of particles answers errors by a few per cent more.
 """
-LEAST_SHARED = 3
-"""Least number of landmarks that a submap shares with the others' map to show a reflection."""
+LEAST_SHARED = 3  # least landmarks that a submap shares with the others' map to show a reflection
 LEAST_MIRRORED = 4  # least number of such submaps
 MIRRORED = 0.8  # least share of them that fit reflected, and not as they are
 MIRRORED_REMEDY = (
@@ -130,7 +129,7 @@ def diagnose(
 
     withdrawn: submaps of withdrawn robots. normal: the right covariance scale; scale: the team's,
     or its cost per degree of freedom. final: see `find_misscaled`. spoilt: see `cuts_of`. localise:
-    the map is a saved one, which shows no robot to be mirrored, since it may be so itself.
+    the map is a saved one, which may be mirrored itself.
     """
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
@@ -169,8 +168,8 @@ def diagnose(
 
 
 def doubt_signs(found: Sequence[m.Diagnosis]) -> list[m.Diagnosis]:
-    """Add the signs of the bearings to the remedies of a robot that is carried off again and again:
-    without landmark names a mirrored robot shows nothing else.
+    """Add the signs of the bearings to the remedies of a robot that is carried off again and again,
+    as a mirrored one is without landmark names.
     """
     jumps = Counter(
         each.robot for each in found if each.cause == hypotheses.CARRIED_OFF and each.at_ns
@@ -191,13 +190,11 @@ def _landmarks_of_saved_maps(fold: Fold) -> set[int | str]:
 
 
 def cuts_of(fold: Fold, spoilt: Spoilt = NO_SPOILT) -> Iterator[m.Diagnosis]:
-    """Describe the cuts of a fold, where a robot was carried off or slipped, with the motion that
-    the odometry did not measure, in the map's frame (x [m], y [m], turn [rad]), where both parts
-    are in one island.
+    """Describe the cuts of a fold, except where a part lies where the odometry puts it, with the
+    motion that the odometry did not measure, in the map's frame (x [m], y [m], turn [rad]), if both
+    parts are in one island.
 
     spoilt: submaps that a cut leaves out between the parts; their motion was measured.
-    A part that lies where the odometry puts it was not carried off. With landmark names the fold
-    makes no cut; a hypothesis names the jump.
     """
     for cut in fold.cuts:
         later = part_of(cut.stream, cut.after)
@@ -290,11 +287,9 @@ _REMEDIES: Mapping[str, str] = {
 def _shared_errors(
     fold: Fold, biases: Sequence[marginals.BiasEstimate], scale: float
 ) -> Iterator[m.Diagnosis]:
-    """Find errors that differ from the robot's configuration beyond doubt.
-
-    Their standard deviation is the larger of the stated one, times the root of a covariance scale
-    above 1, and that from the scatter of the submaps (Student's t); a large error's grows by the
-    error of its sensitivities.
+    """Find errors that differ from the robot's configuration beyond doubt, by the larger of the
+    stated standard deviation, times the root of a covariance scale above 1, and that from the
+    scatter of the submaps (Student's t).
     """
     for found in biases:
         (robot, _), bias, value, stated = found

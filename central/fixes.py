@@ -2,8 +2,8 @@
 
 At a pose node (p, θ) with velocity v, a fix z of the antenna a with covariance σ² I leaves e =
 R(θ)ᵀ (z − p) − a. Fixes late by δ, of an antenna off by b, have e = b − δ v: weighted least squares
-give (b, δ), with covariance scaled by the remaining residuals. Since the map follows its fixes in
-part, the estimates are rather small.
+give (b, δ), with covariance scaled by the remaining residuals. The map follows its fixes in part,
+so the estimates are rather small.
 """
 
 import math

@@ -33,14 +33,12 @@ Tail = Literal["final", "closed", "provisional"]
 """The kind of a map: the last one; one with all submaps up to a time; one with later ones, too."""
 PRIOR_LANDMARKS = 30  # most landmarks in a robot's prior: the nearest ones
 CONFIRMED_BY = 2
-"""Least submaps of an unnamed landmark in the final map: a few false detections in a row look like
-a landmark in one window. Running maps show tentative ones, too.
+"""Least submaps of an unnamed landmark in the final map; a few false detections in a row look like
+one. Running maps show tentative ones, too.
 """
 NAMED = 10  # most names in a list of omitted landmarks, refusals, or robots of an island
 LANDMARKS_ALONE = 100
-"""Most landmarks in the prior of a robot outside the team's map: those nearest to the origin of its
-frame, where the robots of the first day began.
-"""
+"""Most landmarks, those nearest to the frame's origin, in the prior of a robot outside the map."""
 FEW = 3  # most pairs of landmarks without names in such a list
 NONE_SHARED = f"not joined: {SharedPoints(0)}, "
 
@@ -61,9 +59,9 @@ def encoded_landmarks(
 class Shown(NamedTuple):
     """The landmarks of a map, by ascending id.
 
-    Left out: undecided, possible duplicates of a shown one; weak, only of a poorly known heading;
-    missed, by nearly all submaps that look there; `repeated` parts of the map. headings: largest
-    heading standard deviation [rad] of each lost stream. tied: by odometry alone.
+    Left out: undecided, possible duplicates of a shown one; weak, missed, `repeated`: see
+    `distinctness`. headings: largest heading standard deviation [rad] of each lost stream. tied: by
+    odometry alone.
     """
 
     ids: Sequence[int] = ()

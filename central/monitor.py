@@ -2,8 +2,7 @@
 
 Two figures are 1 where every covariance is right. The joint cost per degree of freedom is sharp
 (1.00-1.04 where the map's NEES is 1, 1.10-1.18 where it is 1.4-2), but bounded by a robust loss.
-The covariance scale (docs/decisions/22) is unbounded and insensitive to a minority of outliers; out
-of bounds is one that chance alone reaches less than once in a thousand.
+The covariance scale (docs/decisions/22) is unbounded and insensitive to a minority of outliers.
 """
 
 import math
@@ -18,11 +17,8 @@ from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
 from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
 
 SCALE_WARN = math.sqrt(2.0)  # bound of the team's covariance scale; its inverse is the lower one
-ROBOT_WARN = 1.5
-"""Bound of a robot's covariance scale: one of five sound robots of the real data sets reaches
-1.4."""
-MISCALIBRATED = 0.015
-"""Bound of the mean of the robots' scale biases, beyond which the models are wrong."""
+ROBOT_WARN = 1.5  # bound of a robot's: one of five sound robots of real data sets reaches 1.4
+MISCALIBRATED = 0.015  # bound of the mean of the robots' scale biases
 SIGMAS = 3.0
 SCALE_SIGMAS = 3.3
 
@@ -36,10 +32,8 @@ class Misscale(NamedTuple):
 
 
 def miscalibrations(biases: Sequence[BiasEstimate]) -> tuple[str, ...]:
-    """Describe where the team's data contradict the models of all robots.
-
-    Where odometry and ranges contradict each other about the size of a map, the robots' range
-    scales move in one direction.
+    """Describe where odometry and ranges contradict each other about the size of a map: the range
+    scales of all robots move in one direction.
     """
     known = [(value, sigma) for _, bias, value, sigma in biases if bias == "range_scale"]
     if not known:
@@ -89,8 +83,8 @@ def find_misscaled(
 ) -> tuple[Misscale, ...]:
     """Find the scales out of bounds, the team's unless a minority explains it.
 
-    final: only the final map reports too large covariances: before a loop closure a robot's submaps
-    hardly contradict each other.
+    final: report too large covariances, too; before a loop closure submaps hardly contradict each
+    other.
     """
     scales = _scales(submaps, normal)
     judged = {who: each for who, each in scales.items() if final or each.value > 1.0}

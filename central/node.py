@@ -140,10 +140,8 @@ class CentralNode:
         return self._advance() + self._credit  # the credit comes after the map that it gave
 
     def set_aside(self, message: m.Message, why: str) -> list[Outgoing]:
-        """Continue after an exception in `handle`, and give the sender the credit.
-
-        A member that could not be filed counts as refused. The newest map replaces a failed final
-        one.
+        """Continue after an exception in `handle`: a member that was not filed counts as refused,
+        and the newest map replaces a failed final one.
         """
         out, self._credit = self._credit, []
         self.attendance.note_change(message)

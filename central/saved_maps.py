@@ -25,11 +25,10 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, ids
 
 SCALE = 3e-4
-"""Share of all distances in a map by which the windows of every day may be off alike, so that more
-days do not reduce it: the bias of their Gaussians, and of ranges whose scale is no state.
+"""Share of all distances in a map by which every day may be off alike: the bias of the windows'
+Gaussians, and of ranges whose scale is no state.
 """
-REMAINDER = 1e-3
-"""Part of a prior that stays in the evidence about an error, which some map may not determine."""
+REMAINDER = 1e-3  # part of a prior that stays in the evidence about an undetermined error
 
 COUNTED_TWICE = "and count twice: use a map without them, or another day"
 """End of the warning of `describe_repetition`."""
@@ -56,13 +55,11 @@ def save_map(
     datum: Datum | None = None,
 ) -> m.SavedMap:
     """Make a saved map of a fold's final map; before: those of earlier days, by author. firsts:
-    digest of the first submap of each robot's stream, which reveals maps with measurements in
-    common.
+    digests of the robots' first submaps, which reveal maps with measurements in common.
 
     With the biases c that all sensors share, landmarks and errors of single robots, y = (o, x), are
     N(ȳ + S (c − c̄), P − S C Sᵀ) given c, with S = Cov(y, c) C⁻¹. The map also has the likelihood
-    of (c, o) by the measurements alone: the priors are the later day's, so that each counts once,
-    as Student's t.
+    of (c, o) by the measurements alone: the priors are the later day's, so that each counts once.
 
     Landmarks that are gone are left out. One that moved by e, which chance explains at SEQUENTIAL,
     has covariance P_ii + e eᵀ. Without a common bias of the ranges' scale, that of the map is
@@ -197,11 +194,11 @@ def sensor_warnings(fold: Fold) -> Iterator[str]:
 
 
 def landmark_changes(fold: Fold, shown: Sequence[int]) -> tuple[m.LandmarkChange, ...]:
-    """List the state of each landmark against the saved maps in the main island, by number.
+    """List the state of each landmark against the saved map in the main island with the largest
+    change, by number.
 
-    Of several maps the one with the largest change counts. A landmark that one submap places
-    elsewhere, while none sees it at its former place, is gone. An unnamed one has moved if its
-    former place is empty; else the other place is a new landmark's.
+    A landmark that one submap places elsewhere, while none sees it at its former place, is gone. An
+    unnamed one has moved if its former place is empty; else the other place is a new landmark's.
     """
     if fold.main_key is None:
         return ()

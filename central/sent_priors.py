@@ -16,10 +16,7 @@ from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.shapes import Float, Int64, UInt32
 
-EVERY = 8
-"""Most broadcasts between two priors, which bounds the robot's own submaps to join and the delay of
-a robot that missed one.
-"""
+EVERY = 8  # most broadcasts between two priors
 NEEDED = 12  # number of landmarks nearest to a robot, which it will see next
 MOVED = 0.1
 """Least root mean square of the landmarks' movements for a new prior, in standard deviations."""
@@ -31,8 +28,8 @@ NEVER = -1  # stamp of no inter-robot measurement, before all team time
 class _Sent:
     """A robot's last prior, and the map that it was made of.
 
-    encounter_ns: of the newest inter-robot measurement of or by the robot. since: number of later
-    broadcasts. alone: without a pose.
+    encounter_ns: of the newest inter-robot measurement of or by the robot. since: later broadcasts.
+    alone: without a pose.
     """
 
     blocks: marginals.LandmarkBlocks

@@ -88,10 +88,8 @@ class SubmapFold:
         ahead: bool = True,
         recorded: RecordedFields | None = None,
     ) -> list[Outgoing]:
-        """Make a map of the stored set and the messages that accompany it.
-
-        The final map is the full solution. Others have the ticks up to `closed_ns` and, with
-        `ahead`, all later ones.
+        """Make a map of the stored set and the messages that accompany it: the final one, or one of
+        the ticks up to `closed_ns` and, with `ahead`, all later ones.
         """
         self._file_members()
         ticks, self._accused = self._ticks, {}
@@ -305,32 +303,32 @@ class SubmapFold:
         """Make the priors with news, or the recorded ones; while robots contradict each other, of
         their own fold.
         """
-        out = []
         streams = self._latest_streams(fused) if recorded is None else sorted(recorded.priors_of)
-        parts = [(fold, shown, [each for each in streams if each[0] not in self._apart])]
-        for robot, own in self._apart.items():
-            ids = join_messages.shown_landmarks(own, self.config, "closed").ids
-            parts.append((own, ids, [each for each in streams if each[0] == robot]))
-        seekers = [s for s in parts[0][2] if fold.has_maps and localising.seeks_saved_map(fold, s)]
+        together = [each for each in streams if each[0] not in self._apart]
+        seekers = [s for s in together if fold.has_maps and localising.seeks_saved_map(fold, s)]
+        parts = [(fold, shown, [each for each in together if each not in seekers])]
+        others = [
+            (own, [s for s in streams if s[0] == robot]) for robot, own in self._apart.items()
+        ]
         if seekers:
-            parts[0] = (fold, shown, [each for each in parts[0][2] if each not in seekers])
-            of_map = localising.in_saved_map(fold)
-            parts.append(
-                (of_map, join_messages.shown_landmarks(of_map, self.config, "closed").ids, seekers)
-            )
+            others.append((localising.in_saved_map(fold), seekers))
+        for of, requested in others:
+            ids = join_messages.shown_landmarks(of, self.config, "closed").ids
+            parts.append((of, ids, requested))
+        out = []
         for of, ids, requested in parts:
             if recorded is None:
-                news = self._sent_priors
-                alone = [
-                    s for s in requested if join_messages.gets_landmarks_alone(of, ids, fused, s)
-                ]
-                requested = (
-                    news.select_void(of, requested)
-                    if fused.final
-                    else news.select_worth(of, requested, ids, alone)
-                )
+                requested = self._select_with_news(of, ids, fused, requested)
             out += join_messages.priors(of, ids, fused, requested)
         return out
+
+    def _select_with_news(
+        self, fold: Fold, shown: Sequence[int], fused: m.FusedMap, streams: Sequence[Stream]
+    ) -> list[Stream]:
+        if fused.final:
+            return self._sent_priors.select_void(fold, streams)
+        alone = [s for s in streams if join_messages.gets_landmarks_alone(fold, shown, fused, s)]
+        return self._sent_priors.select_worth(fold, streams, shown, alone)
 
     def _latest_streams(self, fused: m.FusedMap) -> list[Stream]:
         withdrawn = {stream for stream in self.store.chains if stream[0] in fused.withdrawn}

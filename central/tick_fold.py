@@ -8,11 +8,11 @@ tick has arrived, so the fold is final.
                                    │ without the robot    └────fold─────┤
                                    └── Conviction <── agreement(fold) <─┘
 
-A tick pushes a checkpoint; a late submap, a verdict or a withdrawal rolls back, and the ticks are
-folded again. A change of the conviction, the robots that contradict the rest beyond chance
-(`teamslam.central.withdrawal`), folds all ticks again. Agreement is tested after the first tick of
-each broadcast's time and after the full solution, so a withdrawal depends on the set alone. Running
-maps leave out (suspend) a robot with few submaps, until it has enough to be withdrawn.
+A tick pushes a checkpoint; a late submap, a verdict or a withdrawal rolls back. A change of the
+conviction, the robots that contradict the rest beyond chance (`teamslam.central.withdrawal`), folds
+all ticks again. Agreement is tested after the first tick of each broadcast's time and after the
+full solution. Running maps leave out (suspend) a robot with few submaps, until it has enough to be
+withdrawn.
 
 Old submaps are condensed before each tick (`condensing`), and restored by a tick that contradicts
 them (`relinearising`) and by the full solution, which without landmark names folds the ticks again
@@ -45,12 +45,11 @@ from teamslam.team.wire.messages import SightingFactor, Submap
 
 COMMON: tuple[CommonBias, ...] = (*BIASES, "marker")
 """The biases that the whole team may have in common."""
-GROWTH = 1.25  # growth of the set after which suspects that were not withdrawn are tested again
+GROWTH = 1.25  # growth of the set after which suspects are tested again
 LATE_CUTS = 3  # most seams that the final map cuts beside those of running maps
 FULL_UNNAMED = 1000
 """Most submaps without landmark names for which the full solution folds all ticks again, since the
-ticks decide which observations are one landmark. With more, which would take hours, it starts from
-the running fold.
+ticks decide which observations are one landmark: more would take hours.
 """
 
 
@@ -74,8 +73,8 @@ def join_settings(config: CentralConfig) -> joining.JoinSettings:
 class TickFold:
     """Folds a set of submaps tick by tick.
 
-    limits: sizes for condensing; None: never. convicts: whether the fold withdraws robots.
-    undecided: robots that contradict each other.
+    limits: for condensing; None: never. convicts: whether the fold withdraws robots. undecided:
+    robots that contradict each other, in words.
     """
 
     def __init__(
@@ -244,8 +243,8 @@ class TickFold:
     def _convict(self, fold: joining.Fold, at: float) -> bool:
         """Withdraw or suspend the robot that a trial finds; return whether there is one.
 
-        at: the tick; infinity for the full solution, which suspends no robot. Before that, no
-        robot is reported to contradict a saved map: landmarks may have moved since.
+        at: the tick; infinity for the full solution, which suspends no robot. Only that reports a
+        robot that contradicts a saved map, since landmarks may have moved.
         """
         self.undecided = ""
         if not self._tries and math.isfinite(at):
@@ -318,8 +317,8 @@ class TickFold:
         return other
 
     def fold_apart(self, fold: joining.Fold, *, ahead: bool) -> Mapping[str, joining.Fold]:
-        """Fold each robot's submaps by themselves where a robot's disagreement exceeds the limit,
-        and as many times its disagreement alone; a fold in another frame than the team's is empty.
+        """Fold each robot's submaps by themselves where a robot's disagreement exceeds the limit
+        times its disagreement alone (at least 1); a fold in another frame is empty.
         """
         limit = self._config.withdraw_above
         if limit is None or not fold.contributions:

@@ -3,11 +3,10 @@
 A robot's disagreement is the largest of three figures, near or below 1 where its covariances are
 right: its share of the joint cost per degree of freedom; the unweighted χ²/dof that most of its
 submaps exceed, the newest if it has few; and that which most of the newest inter-robot measurements
-by or of it exceed, which finds a robot whose odometry reports no motion. A minority, which the
-robust loss discounts, is no reason to lose the robot.
+by or of it exceed.
 
-One with overconfident covariances, or that fixes the frame, makes only others disagree. So each is
-left out in turn, and withdrawn if the rest agree without it, and without no other. Two robots that
+An overconfident robot, or one that fixes the frame, makes only others disagree. So each is left out
+in turn, and withdrawn if the rest agree without it, and without no other. Two robots that
 contradict each other, and no third, are reported and both stay, unless one contradicts itself when
 alone.
 """
@@ -22,13 +21,10 @@ import numpy as np
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.shapes import Float
 
-LEAST_SUBMAPS = 8
-"""Least submaps of a robot for a median over all of them, and for its withdrawal before the final
-map.
-"""
+LEAST_SUBMAPS = 8  # least submaps for a median over all, and for withdrawal before the final map
 FEWEST, NEWEST, MOST_OF = 2, 4, 3
-"""With fewer submaps a robot is judged by its NEWEST ones, FEWEST at least: the disagreement that
-MOST_OF of them exceed, or all if there are no more.
+"""With fewer submaps a robot is judged by the disagreement that MOST_OF its NEWEST ones exceed, or
+all of FEWEST or more.
 """
 AGREEING = 0.5  # share of the limit that no disagreement may exceed for the rest to agree
 TRIED = 3

@@ -78,6 +78,16 @@ def _is_abandoned(alone: Lasting, peer: Peer) -> bool:
     return left
 
 
+def _make_shell(
+    bus: Bus, peer: PeerRobot | PeerCentre, stop: threading.Event, stored: SetFile
+) -> Shell:
+    shell = Shell(bus, peer, peer.name, stop, _ENDS)
+    shell.take_end = peer.take_end
+    shell.refresh_by(peer.refresh, FRESH_SHARE)
+    shell.notes = lambda: stored.warnings
+    return shell
+
+
 class PeerShell(RobotShell):
     """Process of a robot without a centre; store: file of its set."""
 
@@ -100,11 +110,8 @@ class PeerShell(RobotShell):
         self._peer = PeerRobot(config, central, robots, exchange, when, signer)
         self._peer.load_maps(maps)
         self.node = self._peer.node
-        self.run_in(Shell(bus, self._peer, self._peer.name, stop, _ENDS))
-        self.shell.take_end = self._peer.take_end
-        self.shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = SetFile(store)
-        self.shell.notes = lambda: self._keeper.warnings
+        self.run_in(_make_shell(bus, self._peer, stop, self._keeper))
         self._over, self._alone = Lasting(), Lasting()
 
     def run(self) -> None:
@@ -190,11 +197,8 @@ class CentreShell:
         self._bus = bus
         self._peer = PeerCentre(config, robots, signer)
         self._peer.load_maps(maps)
-        self._shell = Shell(bus, self._peer, CENTRE, stop, _ENDS)
-        self._shell.take_end = self._peer.take_end
-        self._shell.refresh_by(self._peer.refresh, FRESH_SHARE)
         self._keeper = SetFile(store)
-        self._shell.notes = lambda: self._keeper.warnings
+        self._shell = _make_shell(bus, self._peer, stop, self._keeper)
         self._alone = Lasting()
 
     def run(self) -> None:

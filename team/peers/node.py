@@ -18,26 +18,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import WireError, decoded, encoded
 
-GIVEN_BYTES = 32 * 2**20
-"""Most bytes of members per second, to all nodes together."""
-
-
-class Given:
-    """Bytes sent within the current second."""
-
-    def __init__(self) -> None:
-        self._second = 0
-        self._bytes = 0
-
-    def allows(self, now_s: float) -> bool:
-        """Return whether more may be sent now."""
-        if int(now_s) != self._second:
-            self._second, self._bytes = int(now_s), 0
-        return self._bytes < GIVEN_BYTES
-
-    def note(self, size: int) -> None:
-        """Count bytes sent."""
-        self._bytes += size
+GIVEN_BYTES = 32 * 2**20  # most bytes of members per second, to all nodes together
 
 
 def feed_order(message: m.Message) -> int:
@@ -71,18 +52,12 @@ def new_of_streams(replica: Replica, fed: dict[Stream, int]) -> Iterator[m.Messa
         yield from (member.message for member in replica.streams[stream].parcel(sequence))
 
 
-SUMMARY_S = 1.0
-"""Shortest interval [s] between two summaries."""
-LAST_S = 0.2
-"""… once all have concluded: peers leave soon, and compare their maps before."""
-REPEAT_S = 10.0
-"""Longest interval [s], for a node whose appearance was not noticed."""
-PATIENCE_S = 3.0
-"""Time [s] after which an unanswered request goes to another node."""
-FRESH_S = 25.0
-"""Age [s] beyond which a summary does not prove reach."""
-MOST_OPEN = 16_384
-"""Most open requests per node."""
+SUMMARY_S = 1.0  # shortest interval [s] between two summaries
+LAST_S = 0.2  # the same once all have concluded: peers compare their maps and leave soon
+REPEAT_S = 10.0  # longest interval [s], for a node whose appearance was not noticed
+PATIENCE_S = 3.0  # time [s] after which an unanswered request goes to another node
+FRESH_S = 25.0  # age [s] beyond which a summary does not prove reach
+MOST_OPEN = 16_384  # most open requests per node
 
 
 class PeerNode:
@@ -105,7 +80,7 @@ class PeerNode:
         self._summaries: dict[str, tuple[float, m.SetSummary]] = {}
         self._asked: dict[tuple[Stream, int], tuple[float, str]] = {}
         self._failures: dict[str, int] = {}
-        self._given = Given()
+        self._given_s = self._given_bytes = 0  # a second, and the bytes sent within it
         self.known = frozenset({*map(ch.robot_node, robots), "central"})
         self._fed: dict[Stream, int] = {}
         self._new_messages: list[m.Message] = []
@@ -144,17 +119,17 @@ class PeerNode:
 
     def take_carried(self, carried: m.Members) -> list[Member]:
         """Take members that another node carries; return the new ones."""
-        new_messages: list[Member] = []
         if carried.node not in self.known:
             self._refuse(f"members from {carried.node[:80]}, not in this team")
-            return new_messages
+            return []
+        new: list[Member] = []
         rows = zip(carried.keys, carried.payloads, carried.signatures, strict=True)
         for key, payload, signature in rows:
             where = f"{key[:80]} from {carried.node}"
             member = self._open(key, payload, signature, where, is_carried=True)
             if member is not None and self.take(member, carried.node):
-                new_messages.append(member)
-        return new_messages
+                new.append(member)
+        return new
 
     def _open(
         self, key: str, payload: bytes, signature: bytes, where: str, *, is_carried: bool
@@ -276,13 +251,15 @@ class PeerNode:
         if asker not in self.known:
             self._refuse(f"a request of {asker[:80]}, not in this team")
             return []
-        if not self._given.allows(self._now_s):
+        if int(self._now_s) != self._given_s:
+            self._given_s, self._given_bytes = int(self._now_s), 0
+        if self._given_bytes >= GIVEN_BYTES:
             self._refuse(f"requests for more than {GIVEN_BYTES} bytes a second")
             return []
         sign = None if self.proofs is None else self.proofs.of
         answer = make_answer(self.replica, query, self.node, sign)
         batches = [encoded(batch) for batch in answer]
-        self._given.note(sum(map(len, batches)))
+        self._given_bytes += sum(map(len, batches))
         return batches
 
     @property
