@@ -14,7 +14,7 @@ itself gives the same result.
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -170,12 +170,10 @@ def find_odometry_ties(
     )
     submaps, found = island.graph.submaps, []
     for stream in sorted(island.graph.streams):
-        rows = [k for k, each in enumerate(submaps) if each.contribution.stream == stream]
-        elsewhere = np.delete(sees, rows, axis=0).any(axis=0)
+        rows = _rows_of(island, stream)
         places: list[tuple[int, int, int]] = []
-        for k in range(1, len(rows)):
-            rest = elsewhere | sees[rows[:k]].any(axis=0)
-            beyond = sees[rows[k:]].any(axis=0)
+        for k, rest, behind in _list_boundaries(sees, rows):
+            beyond = behind.any(axis=0)
             counts = int((rest & counted).sum()), int((beyond & counted).sum())
             if (rest & beyond).any() or not ((rest & is_shown).any() and (beyond & is_shown).any()):
                 continue
@@ -200,6 +198,21 @@ def find_odometry_ties(
             )
         )
     return found
+
+
+def _rows_of(island: Island, stream: Stream) -> list[int]:
+    submaps = island.graph.submaps
+    return [k for k, each in enumerate(submaps) if each.contribution.stream == stream]
+
+
+def _list_boundaries(
+    sees: Bool[np.ndarray, "K n"], rows: Sequence[int]
+) -> Iterator[tuple[int, Bool[np.ndarray, " n"], Bool[np.ndarray, "k n"]]]:
+    """List each k from 1 with the landmarks of all submaps but rows[k:], and those of these."""
+    elsewhere = np.delete(sees, rows, axis=0).any(axis=0)
+    for k in range(1, len(rows)):
+        rest: Bool[np.ndarray, " n"] = np.logical_or(elsewhere, sees[rows[:k]].any(axis=0))
+        yield k, rest, sees[rows[k:]]
 
 
 def _tabulate(island: Island, nodes: Collection[int]) -> Bool[np.ndarray, "K n"]:
@@ -246,29 +259,21 @@ def find_repetitions(island: Island, ids: Collection[int]) -> list[Repetition]:
         return []
     nodes = [island.graph.landmarks[i] for i in unnamed]
     points, sees = island.points(nodes), _tabulate(island, nodes)
-    streams = [each.contribution.stream for each in island.graph.submaps]
-    found = []
-    for stream in sorted(island.graph.streams):
-        own = np.array([each == stream for each in streams], np.bool_)
-        one = _find_in_stream(island, stream, sees, own, points, unnamed)
-        found += [] if one is None else [one]
-    return found
+    streams = sorted(island.graph.streams)
+    found = (_find_in_stream(island, stream, sees, points, unnamed) for stream in streams)
+    return [each for each in found if each is not None]
 
 
 def _find_in_stream(
     island: Island,
     stream: Stream,
     sees: Bool[np.ndarray, "K n"],
-    own: Bool[np.ndarray, " K"],
     points: Float[np.ndarray, "n 2"],
     ids: list[int],
 ) -> Repetition | None:
-    rows = np.flatnonzero(own)
-    elsewhere = sees[~own].any(axis=0)
+    rows = _rows_of(island, stream)
     candidates = []
-    for k in range(1, len(rows)):
-        rest = elsewhere | sees[rows[:k]].any(axis=0)
-        beyond = sees[rows[k:]]
+    for k, rest, beyond in _list_boundaries(sees, rows):
         fresh = np.flatnonzero(beyond.any(axis=0) & ~rest)
         shared = float((beyond & rest).sum()) / max(float(beyond.sum()), 1.0)
         if len(fresh) >= LEAST_PAIRS and shared <= MOST_SHARED:

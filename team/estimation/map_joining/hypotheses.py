@@ -226,6 +226,25 @@ class _Solved:
     def cost(self) -> float:
         return final_cost(self.island)
 
+    def explained_by(
+        self,
+        cause: SplitCause,
+        subject: int | str,
+        robots: frozenset[str],
+        found: tuple[Island, float],
+        effect: tuple[Values, Covariance],
+        *,
+        dof: int,
+        at_ns: int = 0,
+        price: float = 0.0,
+    ) -> Hypothesis:
+        """Make a hypothesis of a solution with its cost, and of the effect N(value, P)."""
+        (island, cost), (value, P) = found, effect
+        sigma = tuple(np.sqrt(np.diagonal(P) * self.scale).tolist())
+        evidence = self.cost - cost - price
+        size = tuple(value.tolist())
+        return Hypothesis(cause, subject, robots, at_ns, size, sigma, evidence, dof, island)
+
 
 def _solved(island: Island) -> _Solved:
     scale = scale_of(terms(island).submaps)
@@ -288,25 +307,16 @@ def _landmark_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         found = resolved(trial)
         if found is None:
             continue
-        island, cost = found
-        shift, P = _difference(island, node, len(graph.fixed))
-        sigma = np.sqrt(np.diagonal(P) * base.scale)
+        shift = _difference(found[0], node, len(graph.fixed))
         own_sigma = math.sqrt(base.scale * float(np.median(own.spread[:, [0, 2]].max(axis=1))))
-        if float(core.hypot(*shift)) < RESOLVED * own_sigma and base.scale > 1.0:
+        if float(core.hypot(*shift[0])) < RESOLVED * own_sigma and base.scale > 1.0:
             continue
-        price = base.scale * _price(second) if cause == SHARED else 0.0
-        first = int(np.flatnonzero(second)[0])
-        yield Hypothesis(
-            cause,
-            id_,
-            _robots_of(base.island, own.places[_less_frequent(second)]),
-            _begin_ns(base.island, int(own.places[first])) if cause == MOVED else 0,
-            tuple(shift.tolist()),
-            tuple(sigma.tolist()),
-            base.cost - cost - price,
-            2,
-            island,
-        )
+        robots = _robots_of(base.island, own.places[_less_frequent(second)])
+        if cause == SHARED:
+            price, at_ns = base.scale * _price(second), 0
+        else:
+            price, at_ns = 0.0, _begin_ns(base.island, int(own.places[second.argmax()]))
+        yield base.explained_by(cause, id_, robots, found, shift, dof=2, at_ns=at_ns, price=price)
 
 
 def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
@@ -325,39 +335,27 @@ def _seam_hypotheses(base: _Solved, level: float) -> Iterator[Hypothesis]:
         start, end = int(joined.nodes[0]), int(joined.nodes[1])
         robot, stamp = joined.contribution.robot, joined.contribution.end_ns
         own = joined.contribution.local
-        begin, finish = island.value(start), island.value(end)
-        new = len(graph.fixed)
-        before = _begin_ns(island, at)
+        new, before = len(graph.fixed), _begin_ns(island, at)
+        of_robot = robot, frozenset({robot})
         dropped = resolved(without(island, [at]))
-        trials = [(dropped, stamp, len(own.mean))]
-        if dropped is None or base.cost - dropped[1] > base.scale * (level + 2.0 * POSE):
-            at_end = split(island, end, {at}, compose(begin, own.end_pose))
-            trials.append((resolved(at_end), stamp, POSE))
-            if before or _is_known_start(graph, at):
-                back = compose(finish, inverse(own.end_pose))
-                trials.append((resolved(split(island, start, {at}, back)), before, POSE))
-        for k, (found, when, dof) in enumerate(trials):
-            if found is None:
-                continue
-            solved, cost = found
-            if k == 0:
-                motion = own.end_pose, own.covariance[:3, :3]
-                jump, P = motion_beyond(solved, start, end, *motion)
-            else:
-                nodes = (new, end) if k == 1 else (start, new)
-                jump, P = _difference(solved, *nodes)
-            sigma = np.sqrt(np.diagonal(P) * base.scale)
-            yield Hypothesis(
-                CARRIED_OFF,
-                robot,
-                frozenset({robot}),
-                when,
-                tuple(jump.tolist()),
-                tuple(sigma.tolist()),
-                base.cost - cost,
-                dof,
-                solved,
+        if dropped is not None:
+            motion = own.end_pose, own.covariance[:3, :3]
+            jump = motion_beyond(dropped[0], start, end, *motion)
+            yield base.explained_by(
+                CARRIED_OFF, *of_robot, dropped, jump, dof=len(own.mean), at_ns=stamp
             )
+            if base.cost - dropped[1] <= base.scale * (level + 2.0 * POSE):
+                continue
+        there = compose(island.value(start), own.end_pose)
+        trials = [(split(island, end, {at}, there), stamp, (new, end))]
+        if before or _is_known_start(graph, at):
+            back = compose(island.value(end), inverse(own.end_pose))
+            trials.append((split(island, start, {at}, back), before, (start, new)))
+        for trial, at_ns, nodes in trials:
+            found = resolved(trial)
+            if found is not None:
+                jump = _difference(found[0], *nodes)
+                yield base.explained_by(CARRIED_OFF, *of_robot, found, jump, dof=POSE, at_ns=at_ns)
 
 
 def _is_known_start(graph: Graph, place: int) -> bool:
