@@ -12,14 +12,13 @@ from teamslam.team.estimation.map_joining.conditioning import (
     SubmapCorrection,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.marginals import prior_for
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.map_joining.test_conditioning import (
     joined,
     later,
     team_pose,
 )
-from tests.estimation.submap_world import team, wrap
+from tests.estimation.submap_world import prior_for, team, wrap
 
 
 def test_the_team_pose_is_consistent_and_counting_a_submap_twice_is_not():

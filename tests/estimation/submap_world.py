@@ -3,12 +3,17 @@
 The truth is made with complex numbers (x + iy), not with the estimator's geometry.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
+from teamslam.team.estimation.map_joining.conditioning import RobotPrior
 from teamslam.team.estimation.map_joining.gauss_newton import solve_island
+from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.landmark_view import known
+from teamslam.team.estimation.map_joining.marginals import main_priors
 from teamslam.team.estimation.submap import LocalMap
 
 
@@ -85,3 +90,12 @@ def team(seed, robots=2, submaps=8, landmarks=6, size=20.0, reach=12.0, sigmas=(
             pose = end
         paths[robot] = np.array(paths[robot])
     return Team(points, paths, starts, sorted(made, key=lambda each: each.key))
+
+
+def prior_for(
+    fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
+) -> RobotPrior:
+    """A robot's prior with these landmarks of the main island; None: all."""
+    chosen = known(fold.main) if ids is None else sorted(ids)
+    stream = robot, incarnation
+    return main_priors(fold, [stream], len(chosen), chosen)[stream]

@@ -50,10 +50,8 @@ class Seam(NamedTuple):
     evidence: float
 
 
-def find_seam(
-    island: Island, stream: Stream, sequence: int, least: float = EVIDENCE
-) -> Seam | None:
-    """Find a seam of at least this evidence before a submap of a stream, or inside it.
+def find_seam(island: Island, stream: Stream, sequence: int) -> Seam | None:
+    """Find a seam of at least EVIDENCE before a submap of a stream, or inside it.
 
     Returns None with fewer than LEAST_BEFORE submaps before it.
     """
@@ -74,10 +72,10 @@ def find_seam(
         _Side.of(two, slice(SCANS), slice(None)),
     )
     evidence = _compare_sides(island, *sides, _place(island, two, 0.0))
-    if evidence >= least:
+    if evidence >= EVIDENCE:
         return Seam(stream, sequence - 1, sequence, begin_ns, begin_ns, evidence)
     evidence = _compare_inside(island, two)
-    if evidence >= least:
+    if evidence >= EVIDENCE:
         return Seam(stream, sequence - 1, sequence + 1, begin_ns, end_ns, evidence)
     return None
 

@@ -198,13 +198,12 @@ class Island:
         at = self.graph.offset[np.asarray(nodes, np.int64)]
         return np.column_stack([self.state[at], self.state[at + 1]])
 
-    def moved(self, step: Values, older: int = 1) -> "Island":
-        """Add `step` to the state, headings wrapped to (−π, π], and `older` to the ages."""
+    def moved(self, step: Values) -> "Island":
+        """Add a step to the state, headings wrapped to (−π, π]."""
         state = self.state + step
         headings = state[self.graph.headings]
         state[self.graph.headings] += 2.0 * np.pi * np.floor((np.pi - headings) / (2.0 * np.pi))
-        ages = self.age + older, self.sighting_age + older
-        return replace(self, state=state, age=ages[0], sighting_age=ages[1])
+        return replace(self, state=state)
 
     @cached_property
     def selected_covariance(self) -> Values:
@@ -385,7 +384,7 @@ def solve_with_fixed(
         force = (missing - p[unknown]) / q[unknown]
         step = p + force * q
         squared = float(force * step[unknown] - dense.product(gradient, step))
-        island, missing = island.moved(step, 0), missing - float(step[unknown])
+        island, missing = island.moved(step), missing - float(step[unknown])
         if squared < shortest:
             break
     return island

@@ -164,9 +164,7 @@ def scatter_of(fold: Fold, of: BiasEstimate) -> Scatter:
     nodes += [node for bias, node in graph.common.items() if bias == of.bias]
     c = island.posterior.inverse_columns(graph.offset[nodes]).sum(axis=1)
     step = STEP / of.sigma * c
-    rise = (
-        island.moved(step, 0).estimate.counted_chi2 - island.moved(-step, 0).estimate.counted_chi2
-    )
+    rise = island.moved(step).estimate.counted_chi2 - island.moved(-step).estimate.counted_chi2
     moves = -0.25 * of.sigma / STEP * now.weights * rise
     chains: dict[Stream, list[tuple[int, int]]] = {}
     for k, each in enumerate(graph.submaps):
@@ -232,15 +230,6 @@ def landmark_blocks(fold: Fold, ids: Sequence[int] | None = None) -> LandmarkBlo
     return LandmarkBlocks(np.array(chosen, dtype=np.uint32), points_of(island, chosen), covariances)
 
 
-def prior_for(
-    fold: Fold, robot: str, incarnation: int, ids: Sequence[int] | None = None
-) -> RobotPrior:
-    """Make a robot's prior: last end pose and landmarks, jointly."""
-    stream, island = (robot, incarnation), fold.island(robot, incarnation)
-    chosen = known(island) if ids is None else sorted(ids)
-    return _priors_in(island, {stream: chosen})[stream]
-
-
 def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
     """Return the end pose of the stream's last submap, in its island's frame."""
     island = fold.islands[fold.home[stream]]
@@ -248,44 +237,25 @@ def last_pose(fold: Fold, stream: Stream) -> Float[np.ndarray, "3"]:
 
 
 def main_priors(
-    fold: Fold,
-    streams: Sequence[Stream],
-    most: int | None = None,
-    chosen: Sequence[int] | None = None,
+    fold: Fold, streams: Sequence[Stream], most: int, chosen: Sequence[int]
 ) -> dict[Stream, RobotPrior]:
-    """Make the priors (`prior_for`) of streams of the main island.
+    """Make the priors of streams of the main island: last end pose and landmarks, jointly.
 
-    chosen: landmarks by ascending id; None: all. most: largest number in a prior, those nearest to
-    its pose.
+    chosen: landmarks by ascending id, of which a prior has the `most` that are nearest to its pose.
     """
-    island = fold.main
-    ids = np.array(known(island) if chosen is None else chosen)
-    if most is None or len(ids) <= most:
-        return _priors_in(island, dict.fromkeys(streams, ids.tolist()))
+    island, priors = fold.main, {}
+    ids, biases = np.array(chosen, np.uint32), _biases_in(fold.main)
     places = points_of(island, ids.tolist())
-    nearest = {}
     for stream in streams:
-        offsets = places - island.value(island.graph.streams[stream][-1])[:2]
+        node = island.graph.streams[stream][-1]
+        offsets = places - island.value(node)[:2]
         order = np.argsort((offsets * offsets).sum(axis=1), kind="stable")
-        nearest[stream] = sorted(ids[order[:most]].tolist())
-    return _priors_in(island, nearest)
-
-
-def _priors_in(
-    island: Island, landmarks_of: Mapping[Stream, Sequence[int]]
-) -> dict[Stream, RobotPrior]:
-    biases = _biases_in(island)
-    priors = {}
-    for stream, ids in landmarks_of.items():
-        mean, covariance = joint(island, island.graph.streams[stream][-1:], ids)
+        nearest = ids[np.sort(order[:most])]
+        mean, covariance = joint(island, [node], nearest.tolist())
         own = tuple((b.bias, b.value, b.sigma) for b in biases if b.stream == stream)
-        priors[stream] = RobotPrior(
-            mean[:3],
-            np.array(ids, dtype=np.uint32),
-            mean[3:].reshape(-1, 2),
-            covariance,
-            SubmapCorrection(island.settings.covariance_factor, own),
-        )
+        shared = SubmapCorrection(island.settings.covariance_factor, own)
+        points = mean[3:].reshape(-1, 2)
+        priors[stream] = RobotPrior(mean[:3], nearest, points, covariance, shared)
     return priors
 
 

@@ -14,11 +14,11 @@ from teamslam.team.estimation.map_joining.conditioning import (
     remove_landmarks,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
-from teamslam.team.estimation.map_joining.marginals import prior_for, trajectory
+from teamslam.team.estimation.map_joining.marginals import trajectory
 from teamslam.team.estimation.se2 import compose, exponential, tangent
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
-from tests.estimation.submap_world import solved, team, wrap
+from tests.estimation.submap_world import prior_for, solved, team, wrap
 
 OPTIONS = JoinSettings(step_tolerance=1e-11)
 LINEAR = (0.1, 1e-5, 0.2)

@@ -14,12 +14,11 @@ from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_map,
     main_priors,
-    prior_for,
     trajectory,
 )
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
-from tests.estimation.submap_world import team
+from tests.estimation.submap_world import prior_for, team
 
 EXACTLY = JoinSettings(step_tolerance=1e-11)
 
@@ -149,7 +148,7 @@ def test_of_many_landmarks_a_prior_has_the_nearest():
     world = team(9, robots=3)
     fold = joined(world.submaps, world.starts)
     streams = [("r0", 0), ("r2", 0)]
-    few = main_priors(fold, streams, most=4)
+    few = main_priors(fold, streams, 4, sorted(fold.main.graph.landmarks))
     assert sorted(few) == streams
     for robot, incarnation in streams:
         prior, everything = few[robot, incarnation], prior_for(fold, robot, incarnation)

@@ -14,11 +14,11 @@ from teamslam.team.estimation.map_joining.gauss_newton import (
     iterate_tick,
 )
 from teamslam.team.estimation.map_joining.joining import solve_fold
-from teamslam.team.estimation.map_joining.marginals import landmark_blocks, landmark_map, prior_for
+from teamslam.team.estimation.map_joining.marginals import landmark_blocks, landmark_map
 from teamslam.team.estimation.map_joining.submap_graph import EMPTY_GRAPH, add_submaps
 from teamslam.team.estimation.submap import LocalMap
 from tests.estimation.sighting_world import joined_with
-from tests.estimation.submap_world import seen_from, solved, team
+from tests.estimation.submap_world import prior_for, seen_from, solved, team
 
 ROBUST = JoinSettings()
 WHOLE = replace(ROBUST, landmark_gate=math.inf)  # the mutant: one weight for a whole submap

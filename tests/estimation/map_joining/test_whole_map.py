@@ -19,8 +19,7 @@ from teamslam.team.estimation.map_joining.joining import (
     fold_submaps,
     solve_fold,
 )
-from teamslam.team.estimation.map_joining.marginals import prior_for
-from tests.estimation.submap_world import correlated, team
+from tests.estimation.submap_world import correlated, prior_for, team
 
 LINEAR = (0.1, 1e-5, 0.2)
 
