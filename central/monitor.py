@@ -13,7 +13,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.estimation.consistency import Scale
-from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
+from teamslam.team.estimation.map_joining.condensed import SubmapCosts
 from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstimate, scale_of
 
 SCALE_WARN = math.sqrt(2.0)  # bound of the team's covariance scale; its inverse is the lower one

@@ -15,7 +15,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.simulator import simulate
 from teamslam.team import translate
 from teamslam.team.config import Exchange, RobotConfig
-from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
+from teamslam.team.estimation.map_joining.condensed import SubmapCosts
 from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import Agreement, landmark_map
 from teamslam.team.robot.node import RobotNode

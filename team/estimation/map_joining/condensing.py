@@ -1,7 +1,7 @@
 """Bounded fold: old submaps become one quadratic, selected by sequence number only.
 
 The last `lag` submaps of each stream of the main island stay factors. Older ones become one
-quadratic over landmarks, biases and the pose at each stream's boundary (`condensed_factor`). A
+quadratic over landmarks, biases and the pose at each stream's boundary (`condensed`). A
 landmark without a raw submap comes to rest: it is eliminated, as a Gaussian given the other nodes,
 until a submap observes it again.
 
@@ -19,16 +19,19 @@ import numpy as np
 
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE
-from teamslam.team.estimation.map_joining.condensed_factor import (
+from teamslam.team.estimation.map_joining.condensed import (
+    MOST,
+    NOTHING,
     Condensed,
     Departed,
     EliminatedPath,
+    Memory,
+    Observed,
     select_newest,
 )
 from teamslam.team.estimation.map_joining.gauss_newton import PLAIN, Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, terms
-from teamslam.team.estimation.map_joining.memory import MOST, NOTHING, Memory, Observed
 from teamslam.team.estimation.map_joining.submap_graph import Graph, remove_nodes
 from teamslam.team.shapes import Bool, Int64
 
@@ -60,7 +63,7 @@ def condense_submaps(fold: Fold, limits: Limits = LIMITS) -> Fold:
     """Condense the old submaps of the fold's main island.
 
     Unnamed landmarks stay nodes: with these a fold condenses once it has as many submaps as
-    landmarks, stores the observations (`memory`), and drops landmarks that few submaps confirm.
+    landmarks, stores the observations (`condensed`), and drops landmarks that few submaps confirm.
     """
     key, (begin, lag, first) = fold.main_key, limits
     if key is None or fold.size <= begin:

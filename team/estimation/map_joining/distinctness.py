@@ -29,10 +29,10 @@ from teamslam.team.estimation.association.voting import (
     propose_alignments,
 )
 from teamslam.team.estimation.contribution import Stream, is_map
+from teamslam.team.estimation.map_joining.condensed import MOST
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.late_seams import MOST_ABSENT, weigh_places
-from teamslam.team.estimation.map_joining.memory import MOST
 from teamslam.team.estimation.map_joining.nonlinearity import heading_sigma
 from teamslam.team.shapes import Bool, Float, Int64
 

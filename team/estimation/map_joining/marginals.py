@@ -13,7 +13,7 @@ from teamslam.team.config import UNNAMED, Bias
 from teamslam.team.estimation.consistency import Scale, chi2_quantile, covariance_scale
 from teamslam.team.estimation.contribution import Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE, deviation
-from teamslam.team.estimation.map_joining.condensed_factor import SubmapCosts
+from teamslam.team.estimation.map_joining.condensed import SubmapCosts
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.map_joining.gauss_newton import Island, joint_marginal, solve_island
 from teamslam.team.estimation.map_joining.joining import Fold

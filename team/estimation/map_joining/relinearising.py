@@ -12,7 +12,7 @@ import numpy as np
 from teamslam.team.estimation.contribution import Contribution, Key, Stream
 from teamslam.team.estimation.gaussian import UNSOLVABLE
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.condensed_factor import EliminatedPath
+from teamslam.team.estimation.map_joining.condensed import EliminatedPath
 from teamslam.team.estimation.map_joining.condensing import LIMITS
 from teamslam.team.estimation.map_joining.gauss_newton import (
     FULL_AGE,

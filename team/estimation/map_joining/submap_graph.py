@@ -26,8 +26,15 @@ from teamslam.team.estimation.contribution import (
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.condensed_factor import NOBODY, Condensed, Departed
-from teamslam.team.estimation.map_joining.memory import NO_COUNTS, NOTHING, Memory, Observed
+from teamslam.team.estimation.map_joining.condensed import (
+    NO_COUNTS,
+    NOBODY,
+    NOTHING,
+    Condensed,
+    Departed,
+    Memory,
+    Observed,
+)
 from teamslam.team.estimation.se2 import compose, transformed
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64

@@ -5,7 +5,7 @@ import pytest
 
 from teamslam.team import core
 from teamslam.team.estimation.map_joining import marginals
-from teamslam.team.estimation.map_joining.condensed_factor import (
+from teamslam.team.estimation.map_joining.condensed import (
     HISTORY,
     SubmapCosts,
     select_newest,

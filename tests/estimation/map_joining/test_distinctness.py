@@ -6,6 +6,7 @@ from teamslam.central.join_messages import reasons, shown_landmarks
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.association.member_log import LocalLandmark
+from teamslam.team.estimation.map_joining.condensed import MOST
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Contribution,
@@ -13,7 +14,6 @@ from teamslam.team.estimation.map_joining.joining import (
     JoinSettings,
     Tick,
 )
-from teamslam.team.estimation.map_joining.memory import MOST
 from teamslam.team.estimation.map_joining.tick import fold_tick
 from teamslam.team.estimation.submap import LocalMap, Unnamed
 
