@@ -23,13 +23,14 @@ from teamslam.team.estimation.association.landmark_sets import Verdict
 from teamslam.team.estimation.contribution import (
     NO_OWN,
     Contribution,
+    InitialPoseFactor,
     OwnBiases,
     Stream,
     is_map,
     named,
 )
 from teamslam.team.estimation.inter_robot import InterRobotFactor
-from teamslam.team.estimation.map_joining.joining import Fold, InitialPoseFactor, Tick
+from teamslam.team.estimation.map_joining.joining import Fold, Tick
 from teamslam.team.estimation.map_joining.relinearising import restore_submaps
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import Digest, digest_of

@@ -35,6 +35,7 @@ from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.condensing import LIMITS, Limits
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.fold_association import recognise_moved
+from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.late_seams import find_late_seam
 from teamslam.team.estimation.map_joining.marginals import Agreement
 from teamslam.team.estimation.map_joining.relinearising import is_contradicted, is_due
@@ -53,9 +54,9 @@ ticks decide which observations are one landmark: more would take hours.
 """
 
 
-def join_settings(config: CentralConfig) -> joining.JoinSettings:
+def join_settings(config: CentralConfig) -> JoinSettings:
     """Return a centre's settings of the join."""
-    return joining.JoinSettings(
+    return JoinSettings(
         iterations_per_tick=config.gauss_newton_per_tick,
         covariance_factor=config.covariance_factor,
         bias_sigma={bias: getattr(config.bias_sigma, bias) for bias in BIASES},
@@ -107,7 +108,7 @@ class TickFold:
 
     # Inputs.
 
-    def add_start(self, start: joining.InitialPoseFactor) -> None:
+    def add_start(self, start: contribution.InitialPoseFactor) -> None:
         """Add a stream's initial pose, before its submaps."""
         self.inputs.add_start(start)
 

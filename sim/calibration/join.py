@@ -15,13 +15,12 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Window
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
-    Contribution,
     Fold,
-    InitialPoseFactor,
     Tick,
     add_start,
     fold_submaps,

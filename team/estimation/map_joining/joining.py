@@ -71,24 +71,6 @@ from teamslam.team.estimation.map_joining.saved_maps import (
     separate,
 )
 
-__all__ = [
-    "EMPTY_FOLD",
-    "Contribution",
-    "Fold",
-    "InitialPoseFactor",
-    "InterRobotFactor",
-    "JoinSettings",
-    "Stream",
-    "Tick",
-    "add_start",
-    "compact_fold",
-    "fold_submaps",
-    "merge_islands",
-    "precedence",
-    "separate_moved",
-    "solve_fold",
-]
-
 NAMED = 10  # most robots named in the record of a merge
 PATIENCE = 1.1  # growth in submaps after which a failed search is repeated
 
