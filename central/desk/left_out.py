@@ -2,7 +2,7 @@
 
 A window in which a robot was carried off is bent between its ends. Detections may be missing
 between the jump and the window's end, so the window beside it may be bent, too. Both are left out,
-with the pose between them. Where the fold cut the stream (`map_joining.cutting`), the path ends at
+with the pose between them. Where the fold cut the stream (`map_joining.tick`), the path ends at
 the seam.
 """
 
