@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import RobotConfig
-from teamslam.team.core import OdometryInterval, packed, unpacked
+from teamslam.team.core import OdometryInterval, Scan, packed, unpacked
 from teamslam.team.estimation.contribution import (
     NO_OWN,
     Contribution,
@@ -21,7 +21,6 @@ from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix
 from teamslam.team.estimation.inter_robot import BASE, CarriedPoint, InterRobotFactor
 from teamslam.team.estimation.map_joining.conditioning import RobotPrior, SubmapCorrection
 from teamslam.team.estimation.models import steered
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import logarithm
 from teamslam.team.estimation.submap import NO_COLUMNS, NONE_UNNAMED, LocalMap, Unnamed
 from teamslam.team.shapes import Float, UInt32

@@ -19,8 +19,7 @@ from teamslam.sim.calibration.figures import Figure, leave_out_groups
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team import translate
 from teamslam.team.config import AssociationSettings, RobotConfig
-from teamslam.team.estimation.association.certainty import estimate_view
-from teamslam.team.estimation.association.clustering import Clusters, cluster_window
+from teamslam.team.estimation.association.clustering import Clusters, cluster_window, estimate_view
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, relative_to
 from teamslam.team.estimation.hybrid_slam.unnamed_detections import events_of, scans_of
 from teamslam.team.estimation.models import segmenter_of

@@ -15,8 +15,7 @@ from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.gaussian import Matrix, start_of_sensor
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGrid
-from teamslam.team.estimation.models import Increment, noise, segmenter_of
-from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.models import Increment, Own, noise, segmenter_of, unclaimed
 from teamslam.team.estimation.se2 import Pose, between, compose, inverse
 from teamslam.team.shapes import Float, Int64, UInt32
 from teamslam.team.wire import channels as ch

@@ -19,7 +19,7 @@ from teamslam.sim.world.streams import (
     grouped,
 )
 from teamslam.team import translate
-from teamslam.team.estimation.scans import Scan
+from teamslam.team.core import Scan
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.shapes import Float, Int64, UInt32
 from teamslam.team.wire import channels as ch

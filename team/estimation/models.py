@@ -2,6 +2,11 @@
 
 Thrun, Burgard and Fox 2005, sections 5.3 and 6.6, but with motion noise in the tangent space of the
 motion's end, so that motions compose.
+
+A measurement has its own covariance, or the sensor's. `Own` has no rows if no measurement has a
+covariance, else a row (rr [m²], rb [m·rad], bb [rad²], form) for each. POLAR: of range and bearing.
+POINT: of a point in the sensor's frame, to first order: diag(1, 1/r) S diag(1, 1/r), S along and
+across the measured bearing. SENSOR: the sensor's noise, at the predicted range.
 """
 
 import math
@@ -20,8 +25,12 @@ from teamslam.team.shapes import Bool, Float
 __all__ = [
     "LONGEST_NS",
     "NEAREST_M",
+    "POINT",
+    "POLAR",
+    "SENSOR",
     "Increment",
     "Noise",
+    "Own",
     "corrected",
     "increment_of",
     "located",
@@ -33,10 +42,14 @@ __all__ = [
     "segmenter_of",
     "steered",
     "stream_bounds",
+    "unclaimed",
+    "variances",
 ]
 
 LONGEST_NS = 2**62  # bound of the difference of two stamps
 _BOUNDS = Bounds()
+SENSOR, POLAR, POINT = -1.0, 0.0, 1.0
+Own = Float[np.ndarray, "_ _"]
 
 
 class Increment(msgspec.Struct, frozen=True, gc=False):
@@ -179,6 +192,28 @@ def noise_of(sensor: Sensor) -> Noise:
         core.squared(sensor.bearing_sigma),
         sensor.bearing_white,
     )
+
+
+def unclaimed(count: int) -> Own:
+    """Make the rows of measurements without covariances."""
+    return np.empty((count, 0))
+
+
+def variances(
+    ranges: Float[np.ndarray, " n"], own: Own, sensor: Sensor
+) -> Float[np.ndarray, "n 3"]:
+    """Return (rr, rb, bb) of each measurement: claimed, or the sensor's at its range."""
+    of_sensor = np.column_stack(
+        (
+            core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * ranges),
+            np.zeros(len(ranges)),
+            np.full(len(ranges), core.squared(sensor.bearing_sigma)),
+        )
+    )
+    if not own.size:
+        return of_sensor
+    claims = own[:, 3] != SENSOR
+    return np.where(claims[:, None], own[:, :3], of_sensor)
 
 
 def nanoseconds(seconds: float) -> int:

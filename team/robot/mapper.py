@@ -14,13 +14,13 @@ import numpy as np
 
 from teamslam.team import core, translate
 from teamslam.team.config import Exchange, RobotConfig
+from teamslam.team.core import Scan
 from teamslam.team.door import EARLY_NS, LATE_NS
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pipeline import DUE, HybridSlam
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Innovation, RunningWindow
 from teamslam.team.estimation.plausibility import start_beyond
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap, Slipped
 from teamslam.team.rejection import BY_CORE, Rejection
 from teamslam.team.robot.landmark_classes import classify_landmarks

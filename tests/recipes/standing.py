@@ -4,10 +4,9 @@ import numpy as np
 
 from teamslam.sim.studies.robots.filters import NOTHING_NEW, Estimates, KnownMap
 from teamslam.team.config import RobotConfig
-from teamslam.team.core import OdometryInterval
+from teamslam.team.core import OdometryInterval, Scan
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot.maps import InitialPose
 

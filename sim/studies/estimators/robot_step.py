@@ -12,8 +12,7 @@ from teamslam.team.estimation.gaussian import CoreErrors, Matrix, cholesky_facto
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.estimation.models import Increment, noise, noise_of
-from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.models import Increment, Own, noise, noise_of, unclaimed
 from teamslam.team.estimation.se2 import Pose, compose, tangent, wrapped
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
 

@@ -22,13 +22,12 @@ from teamslam.sim.studies.estimators.localisation import Localisation
 from teamslam.sim.studies.estimators.plain_fastslam import PlainFastSlam
 from teamslam.sim.studies.estimators.robot_step import RobotStep, innovation, uncertain_start
 from teamslam.team.config import UNNAMED, Estimator, RobotConfig, Sensor
-from teamslam.team.core import OdometryInterval
+from teamslam.team.core import OdometryInterval, Scan
 from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, Matrix, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import ESTIMATORS
 from teamslam.team.registry import load

@@ -18,11 +18,11 @@ from teamslam.sim.studies.robots.filters import (
 )
 from teamslam.team import core, translate
 from teamslam.team.config import RobotConfig
+from teamslam.team.core import Scan
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.pose_grid import TeammateScan
 from teamslam.team.estimation.hybrid_slam.window import Innovation, RunningWindow
 from teamslam.team.estimation.models import stream_bounds
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
 from teamslam.team.rejection import BY_CORE, UNMEASURED, Rejection
 from teamslam.team.robot.mapper import Mapper

@@ -12,6 +12,7 @@ from teamslam.sim.studies.estimators.robot_step import POSE_FLOOR, RobotStep
 from teamslam.sim.studies.robots.filters import FILTERS, Estimates, KnownMap
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, RobotConfig
+from teamslam.team.core import Scan
 from teamslam.team.estimation.gaussian import (
     LandmarkGaussian,
     NotACovarianceError,
@@ -20,7 +21,6 @@ from teamslam.team.estimation.gaussian import (
 )
 from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation, generator
 from teamslam.team.estimation.models import Increment, segmenter_of
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.se2 import inverse
 from teamslam.team.estimation.submap import Became
 from teamslam.team.pairs import FEEDBACK

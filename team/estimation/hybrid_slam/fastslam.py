@@ -14,8 +14,7 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.core import effective_sample_size, normalise, systematic_parents
 from teamslam.team.estimation.gaussian import CoreErrors
-from teamslam.team.estimation.models import Increment, noise_of
-from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.models import Increment, Own, noise_of, unclaimed
 from teamslam.team.shapes import Float, Int64, UInt32
 
 __all__ = [
@@ -118,7 +117,7 @@ def propagated_and_updated(
 
     Resampling, below an effective sample size of `resample_below`·M, comes first, so a window's
     last step keeps its weights. ranges [m] and bearings [rad] are calibrated; own: their
-    covariances (`teamslam.team.estimation.scans`); an id may occur twice. Draws M × 3 normal
+    covariances (`teamslam.team.estimation.models`); an id may occur twice. Draws M × 3 normal
     numbers, and one uniform one if it resamples. Raises NotACovarianceError.
     """
     parents = None

@@ -23,6 +23,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import RobotConfig
+from teamslam.team.core import Scan
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.pose_grid import PoseGrid, TeammateScan
@@ -42,7 +43,6 @@ from teamslam.team.estimation.hybrid_slam.window import (
 from teamslam.team.estimation.inter_robot import CarriedPoint
 from teamslam.team.estimation.models import Increment, nanoseconds, noise_of, segmenter_of
 from teamslam.team.estimation.plausibility import submap_beyond
-from teamslam.team.estimation.scans import Scan
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.rejection import BY_CORE, Rejection
 

@@ -20,8 +20,7 @@ from teamslam.team.estimation.association.scans import Scans, points_of
 from teamslam.team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
 from teamslam.team.estimation.hybrid_slam.fastslam import effective_sample_size, normalise
 from teamslam.team.estimation.hybrid_slam.window import Window
-from teamslam.team.estimation.models import noise_of
-from teamslam.team.estimation.scans import POINT, variances
+from teamslam.team.estimation.models import POINT, noise_of, variances
 from teamslam.team.estimation.se2 import adjoint, between, inverse
 from teamslam.team.shapes import Float, Int64
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import UNNAMED, AssociationSettings, Sensor
+from teamslam.team.core import Scan
 from teamslam.team.estimation.association.clustering import associate_window
 from teamslam.team.estimation.association.scans import UNASSIGNED, Scans, points_of
 from teamslam.team.estimation.association.tracking import Slip, slip_covariance
-from teamslam.team.estimation.models import Increment
-from teamslam.team.estimation.scans import Scan, variances
+from teamslam.team.estimation.models import Increment, variances
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import NONE_UNNAMED, Became, Slipped, Unnamed
 from teamslam.team.shapes import Bool, Int64

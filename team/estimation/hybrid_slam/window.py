@@ -19,8 +19,7 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import FAULTS, CoreErrors, NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
-from teamslam.team.estimation.models import Increment, noise_of
-from teamslam.team.estimation.scans import Own, unclaimed
+from teamslam.team.estimation.models import Increment, Own, noise_of, unclaimed
 from teamslam.team.estimation.se2 import tangent
 from teamslam.team.estimation.submap import Became, LocalMap, Slipped
 from teamslam.team.shapes import Float, Int64, UInt32
@@ -107,7 +106,7 @@ class Window(msgspec.Struct, gc=False):
 
     @property
     def own(self) -> Own:
-        """Noises that the measurements claim (`teamslam.team.estimation.scans`)."""
+        """Noises that the measurements claim (`teamslam.team.estimation.models`)."""
         return self.core.measurements()[3]
 
     @property
@@ -192,7 +191,7 @@ def advance(
 
     The measurements are accepted and corrected (`models.scanned`). The innovation omits those of
     singular predictive covariance. forward: the motion's shift by an error of the scale of speed,
-    and its duration (`core.Odometry`). own: claimed noises (`teamslam.team.estimation.scans`).
+    and its duration (`core.Odometry`). own: claimed noises (`teamslam.team.estimation.models`).
     Raises NotACovarianceError, and leaves the window unchanged.
     """
     seen = ids, ranges, bearings, unclaimed(len(ids)) if own is None else own

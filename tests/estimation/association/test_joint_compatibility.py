@@ -6,8 +6,7 @@ import pytest
 
 from teamslam.team.association import AssociationProfile
 from teamslam.team.config import AssociationSettings
-from teamslam.team.estimation.association.certainty import marginals
-from teamslam.team.estimation.association.clustering import associate_window
+from teamslam.team.estimation.association.clustering import associate_window, marginals
 from teamslam.team.estimation.association.gating import (
     SPLIT,
     Joint,

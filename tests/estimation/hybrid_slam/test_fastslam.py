@@ -7,8 +7,7 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.core import moments
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.models import Increment, Noise
-from teamslam.team.estimation.scans import unclaimed
+from teamslam.team.estimation.models import Increment, Noise, unclaimed
 from tests.estimation.submap_world import wrap
 
 quick = settings(deadline=None, max_examples=60)
