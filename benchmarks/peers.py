@@ -1,11 +1,10 @@
 """Measure a spreading set by topology: bytes of each robot, and the time until all agree.
 
-`python -m benchmarks.peers [--json FILE] [--picture FILE]`: peers without estimators, each of which
+`python -m benchmarks.peers [--json FILE]`: peers without estimators, each of which
 closes a submap of 1.2 kB every 10 s for 300 s of team time and exchanges messages every second. The
 star is a centre's traffic per robot.
 """
 
-import argparse
 import heapq
 import json
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.baseline import parser_of
 from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.wire import channels as ch
@@ -185,43 +185,10 @@ def measure_spreading(topology: str, robots: int) -> dict[str, float]:
     }
 
 
-def draw_spreading(found: dict[str, dict[str, float]], path: Path) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9.0, 3.8), sharex=True, sharey=True)
-    names = {"said_b_s": "said, a broadcast once", "heard_b_s": "heard"}
-    for axis, (figure_name, title) in zip(axes, names.items(), strict=True):
-        star: list[tuple[int, float]] = []
-        for topology in TOPOLOGIES:
-            rows = sorted(
-                (int(name.partition("/")[2]), row)
-                for name, row in found.items()
-                if name.startswith(f"{topology}/")
-            )
-            robots, values = [n for n, _ in rows], [row[figure_name] for _, row in rows]
-            axis.plot(robots, values, "o-", label=topology, markersize=4)
-            star += [(n, row["star_b_s"]) for n, row in rows]
-        star = sorted(set(star))
-        axis.plot([n for n, _ in star], [b for _, b in star], "k--", label="star, of one robot")
-        axis.set(title=title, xlabel="robots", xscale="log", yscale="log")
-        axis.minorticks_off()
-        axis.set_xticks(TEAMS, [str(each) for each in TEAMS])
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("bytes per robot and second")
-    axes[0].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
 def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--json", type=Path)
+    options = parser_of(__doc__)
     options.add_argument("--teams", type=int, nargs="*", default=list(TEAMS))
     options.add_argument("--topologies", nargs="*", default=list(TOPOLOGIES))
-    options.add_argument("--picture", type=Path, help="how it grows with the number of robots")
     chosen = options.parse_args()
     before = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
     found, worse = {}, []
@@ -240,8 +207,6 @@ def main(show: Callable[[str], Any] = sys.stdout.write) -> int:
     if chosen.json is not None:
         there = json.loads(chosen.json.read_text()) if chosen.json.exists() else {}
         chosen.json.write_text(json.dumps(there | found, indent=1) + "\n")
-    if chosen.picture is not None:
-        draw_spreading(before | found, chosen.picture)
     show("".join(f"worse: {each}\n" for each in worse))
     return 1 if worse else 0
 

@@ -40,10 +40,8 @@ def test_a_robot_whose_earlier_life_has_gone_begins():
 
 
 class Source:
-    answers = True
-
     def __init__(self, network: MemoryNetwork) -> None:
-        self.bus = MemoryBus(network)
+        self.network, self.bus = network, MemoryBus(network)
         self.start = published(stream("r1", 3))[0]
         self.asked: list[tuple[int, int, int]] = []
         self.bus.answer(ch.MEASUREMENTS, "r1", self.answer)
@@ -51,7 +49,7 @@ class Source:
     def answer(self, request: bytes) -> list[bytes]:
         wanted = decoded(request, m.MeasurementsRequest)
         self.asked.append((wanted.incarnation, wanted.first, wanted.last))
-        return [encoded(self.start)] if self.answers else []
+        return [encoded(self.start)]
 
     def begins(self, incarnation: int) -> None:
         said = msgspec.structs.replace(self.start, incarnation=incarnation)
@@ -59,9 +57,9 @@ class Source:
 
 
 def lived(
-    network: MemoryNetwork, bus: MemoryBus, act: Callable[[], None], waits_s: float = 0.0
+    source: Source, act: Callable[[], None], waits_s: float = 0.0, bus: MemoryBus | None = None
 ) -> RobotShell:
-    stop = threading.Event()
+    stop, bus = threading.Event(), bus or MemoryBus(source.network)
     shell = RobotShell(bus, config("r1"), stop, patience_s=0.0)
     shell.shell.begin = act  # when it has subscribed
     duty, turns = shell._duty, iter(range(5))
@@ -78,14 +76,13 @@ def lived(
 
 
 def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone():
-    network = MemoryNetwork()
-    source = Source(network)
+    source = Source(MemoryNetwork())
 
     def act() -> None:
         source.begins(4)  # a stranger's
         source.begins(1)
 
-    shell = lived(network, MemoryBus(network), act)
+    shell = lived(source, act)
     assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
     assert shell.shell.boundary.refused == 1
     warnings = str(shell.shell.boundary.warnings)
@@ -93,15 +90,14 @@ def test_a_new_incarnation_is_begun_by_the_word_of_the_source_alone():
 
 
 def test_a_robot_asks_its_source_for_what_a_death_has_cost_its_own_log(tmp_path):
-    network = MemoryNetwork()
-    source = Source(network)
-    bus = MemoryBus(network)
+    source = Source(MemoryNetwork())
+    bus = MemoryBus(source.network)
     with own_log(tmp_path / "r1.mcap", "t") as log:
         measured = msgspec.structs.replace(odometry(5, "r1"), incarnation=1)
         later = Outgoing(ch.ODOMETRY, "r1", measured)
         log([Sample(later.key, encoded(later.message), 0, 0, 0)])
         bus.tap = log
-        shell = lived(network, bus, lambda: source.begins(1))
+        shell = lived(source, lambda: source.begins(1), bus=bus)
     assert shell.node.next_measurement == 1
     assert (1, 0, 0) in source.asked, "the robot has used it, its log has lost it"
     assert not any(first > 0 for _, first, _ in source.asked), "it asks for these itself"
@@ -124,7 +120,7 @@ def test_an_end_before_forged_measurements_is_believed_by_the_word_of_the_source
             forged = msgspec.structs.replace(odometry(number, "r1"), incarnation=1)
             source.bus.publish(Outgoing(ch.ODOMETRY, "r1", forged))
 
-    shell = lived(network, MemoryBus(network), act)
+    shell = lived(source, act)
     assert shell.node.next_measurement == 3
     assert source.asked == [(0, 0, 0), (1, 0, 1)]
     (said,) = viewer.receive()
@@ -153,7 +149,7 @@ def test_an_end_that_is_not_the_sources_is_refused_and_the_stream_goes_on():
             end = build.end(incarnation=incarnation, r1=count)
             source.bus.publish(Outgoing(ch.END, "", end))
 
-    shell = lived(network, MemoryBus(network), act)
+    shell = lived(source, act)
     assert shell.shell.boundary.refused == 3
     (said,) = viewer.receive()
     assert decoded(said.payload, m.Done).measurements == 2
@@ -171,14 +167,13 @@ def test_where_a_world_ends_a_stream_no_drivers_word_goes_further(state):
         source.bus.publish(Outgoing(ch.HEAD, "r1", head))
         source.bus.publish(Outgoing(ch.END, "", build.end(r1=2)))
 
-    lived(network, MemoryBus(network), act, waits_s=0.3)
+    lived(source, act, waits_s=0.3)
     (said,) = viewer.receive()
     assert decoded(said.payload, m.Done).measurements == 2, "measurement 1 was asked for"
 
 
 def test_a_stream_begins_where_its_source_says():
-    network = MemoryNetwork()
-    source = Source(network)
+    source = Source(MemoryNetwork())
 
     def act() -> None:
         forged = msgspec.structs.replace(source.start, stamp_ns=2**61)
@@ -186,7 +181,7 @@ def test_a_stream_begins_where_its_source_says():
         measured = msgspec.structs.replace(odometry(1, "r1"), incarnation=1)
         source.bus.publish(Outgoing(ch.ODOMETRY, "r1", measured))
 
-    shell = lived(network, MemoryBus(network), act)
+    shell = lived(source, act)
     assert (shell.node.next_measurement, shell.shell.boundary.refused) == (2, 0)
 
 
@@ -196,14 +191,13 @@ def test_submaps_of_an_incarnation_that_the_source_does_not_know_are_not_taken_o
     forged = msgspec.structs.replace(source.start, incarnation=7)
     submap = msgspec.structs.replace(submaps_of(stream("r1", 12))[0], incarnation=7)
     centre.answer(ch.SUBMAPS, "", lambda _: [encoded(forged), encoded(submap)])
-    shell = lived(network, MemoryBus(network), lambda: source.begins(1))
+    shell = lived(source, lambda: source.begins(1))
     assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
 
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number):
-    network = MemoryNetwork()
-    source = Source(network)
+    source = Source(MemoryNetwork())
 
     def act() -> None:
         source.begins(1)
@@ -212,6 +206,6 @@ def test_only_its_initial_pose_begins_an_incarnation_and_only_once(number):
         channel, message = ((ch.ODOMETRY, forged), (ch.START, again))[number]
         source.bus.publish(Outgoing(channel, "r1", message))
 
-    shell = lived(network, MemoryBus(network), act)
+    shell = lived(source, act)
     assert (shell.node.incarnation, shell.node.next_measurement) == (1, 1)
     assert "the initial pose is measurement 0" in shell.shell.boundary.last_refused

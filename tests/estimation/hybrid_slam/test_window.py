@@ -185,11 +185,7 @@ CASES = {
     "standing before one landmark": [(STANDING, SIGHT)] * 8,
     "a gap": [(GAP, NOTHING)],
     "a gap and a measurement": [(GAP, SIGHT)],
-    "a measurement, a gap and the measurement again": [
-        (DRIVEN, SIGHT),
-        (GAP, SIGHT),
-        (DRIVEN, SIGHT),
-    ],
+    "a measurement, a gap and the measurement": [(DRIVEN, SIGHT), (GAP, SIGHT), (DRIVEN, SIGHT)],
     "a very far landmark": [(DRIVEN, FAR), (DRIVEN, FAR)],
     "a landmark that jumps": [(DRIVEN, SIGHT), (DRIVEN, ELSEWHERE), (STANDING, ELSEWHERE)],
     "a landmark underfoot": [(DRIVEN, UNDERFOOT), (STANDING, UNDERFOOT), (DRIVEN, SIGHT)],
@@ -199,10 +195,8 @@ CASES = {
 @pytest.mark.parametrize("particles", [4, 100])
 @pytest.mark.parametrize("case", CASES)
 def test_an_odd_window_still_becomes_a_covariance(case, particles):
-    window, random = (
-        windows.open_window(FrontEnd(particles=particles), ACCURATE),
-        random_numbers(2, "a", 0, 0),
-    )
+    random = random_numbers(2, "a", 0, 0)
+    window = windows.open_window(FrontEnd(particles=particles), ACCURATE)
     for motion, keyframe in CASES[case]:
         windows.advance(window, increment(motion), *keyframe, random)
     local = windows.gaussian(window)
