@@ -1,4 +1,5 @@
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pytest
@@ -135,6 +136,7 @@ def test_the_order_of_measurements_and_the_names_of_landmarks_do_not_matter():
     np.testing.assert_array_equal(other.judged(), taken[order])
 
 
+@cache
 def world_of(name: str, kind: str, outlier_share: float) -> WorldStreams:
     scenario = load(name)
     return streams_of(with_world(scenario, outlier_share=outlier_share, outlier_kind=kind))
