@@ -82,8 +82,6 @@ class Presence:
                 self.heads[message.robot] = later_head(message, head)
             case m.FusedMap():
                 self.has_ended = True
-            case _:
-                pass
 
     def is_there(self, node: str) -> bool:
         """Whether the node is alive."""

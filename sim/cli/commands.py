@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType, UnionType
+from types import UnionType
 from typing import Any, Literal, NamedTuple, NoReturn, TypeVar, get_args, get_origin
 
 import click
@@ -18,11 +18,9 @@ ARGUMENTS = "Arguments"
 OPTIONS = "Options"  # section of the options that most users need
 NETWORK = "Network and keys"
 RARE = "Rarely needed"
-LAST: Mapping[str, int] = MappingProxyType({RARE: 1, NETWORK: 2})
+LAST: Mapping[str, int] = {RARE: 1, NETWORK: 2}
 """Order of the sections behind the others."""
-PLACEHOLDERS: Mapping[object, str] = MappingProxyType(
-    {str: "TEXT", int: "N", float: "X", Path: "PATH"}
-)
+PLACEHOLDERS: Mapping[object, str] = {str: "TEXT", int: "N", float: "X", Path: "PATH"}
 """Placeholder of an option's value by its type, if the option has none."""
 WRONG_USE = 2
 FAILED = 1

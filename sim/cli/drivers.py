@@ -113,10 +113,7 @@ def driver(
             on_odometry=None if live is None else live.add_odometry,
         )  # fmt: skip
         with ForeignKeys(
-            ros2_connect or connect,
-            translated.keys,
-            translated.tokens,
-            latched=translated.latched,
+            ros2_connect or connect, translated.keys, translated.tokens, latched=translated.latched
         ) as foreign:
             _LOG.info("listening to %s", ", ".join((*translated.keys, *translated.latched)))
             publisher = RosPublisher(foreign, f"teamslam_{robot}", topics.domain)

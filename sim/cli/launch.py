@@ -26,12 +26,7 @@ from teamslam.sim.cli.commands import (
 from teamslam.sim.cli.importing import import_into
 from teamslam.sim.cli.results import Steps, print_evaluation, print_nis, print_written, read_run
 from teamslam.sim.cli.view import FoxglovePort, Open, Port, show_on_page
-from teamslam.sim.scenarios.scenario import (
-    ASSUMED_NAME,
-    Scenario,
-    scenario_warnings,
-    with_options,
-)
+from teamslam.sim.scenarios.scenario import ASSUMED_NAME, Scenario, scenario_warnings, with_options
 from teamslam.team.extras import install_command
 
 if TYPE_CHECKING:

@@ -130,8 +130,7 @@ def cut(
 
 @app.declare("teamslam log merge r1.mcap r2.mcap -o team.mcap")
 def merge(
-    logs: Annotated[list[Path], argument("Logs of one team: of robots, or parts.")],
-    output: NewLog,
+    logs: Annotated[list[Path], argument("Logs of one team: of robots, or parts.")], output: NewLog
 ) -> None:
     """Merge logs by team time; messages that several logs have are written once."""
     from teamslam.team.recording.editing import merge as merge_logs

@@ -299,11 +299,7 @@ def record(
 
     resolved = opt.scenario_of(scenario)
     output.parent.mkdir(parents=True, exist_ok=True)
-    metadata = {
-        **provenance(),
-        "seed": str(resolved.seed),
-        "scenario": dumps(resolved),
-    }
+    metadata = {**provenance(), "seed": str(resolved.seed), "scenario": dumps(resolved)}
     exists = output.exists()
     if exists and not output.is_file():
         opt.refuse_existing(output)

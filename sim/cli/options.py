@@ -115,11 +115,7 @@ def check_pieces(scenario: Scenario) -> None:
 
 
 def connect_bus(
-    team: str,
-    connect: str,
-    keys: Path | None,
-    node: str,
-    stop: threading.Event | None = None,
+    team: str, connect: str, keys: Path | None, node: str, stop: threading.Event | None = None
 ) -> "ZenohBus":
     """Connect to the router, with keys by TLS; stop: ends the wait for it."""
     from teamslam.team.wire.zenoh.bus import ZenohBus

@@ -181,8 +181,7 @@ def _width(text: str | None, look: Look | None) -> float | None:
 
 @app.declare("teamslam repair team.mcap -o whole.mcap")
 def repair(
-    log: opt.LogArgument,
-    output: Annotated[Path, output_option("The new, complete log.", "FILE")],
+    log: opt.LogArgument, output: Annotated[Path, output_option("The new, complete log.", "FILE")]
 ) -> None:
     """Complete a log or a ROS 2 bag (.mcap) whose recorder was killed: all up to its last flush."""
     from teamslam.sim.importing.source import is_own_log

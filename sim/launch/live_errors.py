@@ -77,8 +77,6 @@ class LiveErrors:
                 self._truth = TrueLandmarks.of(message)
             case m.FusedMap():
                 self._take_map(message)
-            case _:
-                pass
 
     def _robot(self, name: str) -> _Robot:
         return self._robots.setdefault(name, _Robot())

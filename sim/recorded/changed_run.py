@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, cast
 
 import msgspec
@@ -13,14 +12,7 @@ from teamslam.sim.in_memory.team import Conditions, Partition, run_nodes
 from teamslam.sim.recorded.world import RecordedWorld, Samples
 from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.sim.scenarios.scenario import Scenario, with_options
-from teamslam.team.config import (
-    MAP,
-    Alphas,
-    MotionModel,
-    MotionNoise,
-    RobotConfig,
-    Sensor,
-)
+from teamslam.team.config import MAP, Alphas, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.saved_map import read_map
 from teamslam.team.wire import channels as ch
@@ -124,14 +116,8 @@ def _conditions(scenario: Scenario, changes: Changes, first_ns: int) -> Conditio
     )
 
 
-KINDS: Mapping[str, str] = MappingProxyType(
-    {
-        "odometry": "every noise of motion",
-        "range": "the range's standard deviation",
-        "bearing": "the bearing's standard deviation",
-    }
-)
-"""Kinds of noise, and the scaled parameters."""
+KINDS = ("odometry", "range", "bearing")
+"""Noise that is scaled: of motion, or a standard deviation."""
 
 
 def _changed_robot(

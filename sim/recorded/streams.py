@@ -1,7 +1,8 @@
 """Measurement streams of a log, as of a world."""
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,16 @@ def measurements_in(path: Path) -> tuple[WorldStreams, Scenario]:
         raise LogError(path, str(error), PART) from None
 
 
+@dataclass
+class _Robot:
+    """Messages of one robot; later: (incarnation, number) of measurements of later incarnations."""
+
+    measurements: dict[int, m.Measurement] = field(default_factory=dict)
+    later: set[tuple[int, int]] = field(default_factory=set)
+    truth: list[m.Truth] = field(default_factory=list)
+    labels: m.TruthLabels | None = None
+
+
 def recorded_streams(
     messages: Sequence[m.Message], source: str, clocks: Mapping[str, float] | None = None
 ) -> WorldStreams:
@@ -59,76 +70,51 @@ def recorded_streams(
     clocks: corrected offset of each odometry clock [s].
     """
     offsets = {} if clocks is None else clocks
-    measurements: dict[str, dict[int, m.Measurement]] = {}
-    later: dict[str, dict[int, set[int]]] = {}
-    truth: dict[str, list[m.Truth]] = {}
-    labels: dict[str, m.TruthLabels] = {}
+    found: dict[str, _Robot] = defaultdict(_Robot)
     landmark_ids, landmarks = np.empty(0, np.uint32), None
     for message in messages:
         match message:
             case m.Measurement() if message.incarnation == 1:
-                measurements.setdefault(message.robot, {})[message.number] = message
+                found[message.robot].measurements[message.number] = message
             case m.Measurement():
-                of = later.setdefault(message.robot, {}).setdefault(message.incarnation, set())
-                of.add(message.number)
+                found[message.robot].later.add((message.incarnation, message.number))
             case m.TruthLabels():
-                labels[message.robot] = message
+                found[message.robot].labels = message
             case m.Truth():
-                truth.setdefault(message.robot, []).append(message)
+                found[message.robot].truth.append(message)
             case m.TruthLandmarks():
                 landmark_ids = ids(message.ids, "ids")
                 landmarks = floats(message.positions, "positions").reshape(-1, 2)
-            case _:
-                pass
-    streams = [
-        _stream(
-            robot,
-            [of[i] for i in sorted(of)],
-            truth.get(robot, []),
-            labels.get(robot),
-            tuple(sorted(measurements)),
-            offsets.get(robot, 0.0),
-        )
-        for robot, of in sorted(measurements.items())
-    ]
+    robots = tuple(sorted(robot for robot, of in found.items() if of.measurements))
+    streams = [_stream(robot, found[robot], robots, offsets.get(robot, 0.0)) for robot in robots]
+    why = "left out: its stream began anew, and a data set has one stream of each robot"
     notes = [
-        f"{robot}: "
-        + count_note(
-            sum(map(len, of.values())),
-            "measurement",
-            "left out: its stream began anew, and a data set has one stream of each robot",
-        )
-        for robot, of in sorted(later.items())
+        f"{robot}: {count_note(len(of.later), 'measurement', why)}"
+        for robot, of in sorted(found.items())
+        if of.later
     ]
     return WorldStreams(tuple(streams), landmark_ids, landmarks, source, tuple(notes))
 
 
-def _stream(
-    robot: str,
-    measurements: Sequence[m.Measurement],
-    truth: Sequence[m.Truth],
-    labels: m.TruthLabels | None,
-    robots: tuple[str, ...],
-    clock_offset_s: float,
-) -> RobotStream:
+def _stream(robot: str, of: _Robot, robots: tuple[str, ...], clock_offset_s: float) -> RobotStream:
+    measurements = [of.measurements[number] for number in sorted(of.measurements)]
     starts = [each for each in measurements if isinstance(each, m.InitialPose)]
     odometry = [each for each in measurements if isinstance(each, m.AnyOdometry)]
     seen = [each for each in measurements if isinstance(each, m.AnyScan | m.Detections)]
     sighted = [each for each in measurements if isinstance(each, m.Sightings)]
     fixes = [each for each in measurements if isinstance(each, m.Fix)]
     pose, covariance = translate.pose_of(starts[0]) if starts else (None, None)
-    intervals = intervals_of(robot, odometry, clock_offset_s)
     mixed = (_forms_of(odometry), _forms_of(seen))
-    truth = sorted(truth, key=lambda each: each.stamp_ns)
+    truth = sorted(of.truth, key=lambda each: each.stamp_ns)
     times = [stamps(each.stamps, "stamps") for each in truth]
     poses = [floats(each.poses, "poses").reshape(-1, 3) for each in truth]
     return RobotStream(
         robot=robot,
         start_ns=measurements[0].stamp_ns,
         start=None if pose is None else StartPose(pose, covariance),
-        intervals=intervals,
-        landmark_detections=landmarks_of(seen, labels),
-        teammate_detections=_detections(sighted, [_indices(each, robots) for each in sighted]),
+        intervals=intervals_of(robot, odometry, clock_offset_s),
+        landmark_detections=landmarks_of(seen, of.labels),
+        teammate_detections=_sightings(sighted, robots),
         teammates=robots,
         fixes_ns=np.array([each.stamp_ns for each in fixes], np.int64),
         fixes=np.array([_fix(each) for each in fixes]).reshape(-1, 5),
@@ -140,22 +126,18 @@ def _stream(
     )
 
 
-def _indices(sighting: m.Sightings, robots: tuple[str, ...]) -> np.ndarray:
-    return np.array([robots.index(name) for name in sighting.teammates], dtype=np.uint32)
-
-
 def _fix(fix: m.Fix) -> Float[np.ndarray, "5"]:
     covariance = floats(fix.covariance, "covariance") if fix.covariance else np.full(3, np.nan)
     return np.concatenate([floats(fix.position, "position"), covariance])
 
 
-def _detections(messages: Sequence[m.Sightings], names: Sequence[np.ndarray]) -> Detections:
-    counts = [len(each) for each in names]
-    at = np.repeat(np.array([each.stamp_ns for each in messages], dtype=np.int64), counts)
+def _sightings(messages: Sequence[m.Sightings], robots: tuple[str, ...]) -> Detections:
+    at = [each.stamp_ns for each in messages for _ in each.teammates]
+    seen = [robots.index(name) for each in messages for name in each.teammates]
     none = [np.empty(0)]
     ranges = np.concatenate([*none, *(floats(each.ranges, "ranges") for each in messages)])
     bearings = np.concatenate([*none, *(floats(each.bearings, "bearings") for each in messages)])
-    return grouped(at, np.concatenate([np.empty(0, np.uint32), *names]), ranges, bearings)
+    return grouped(np.array(at, np.int64), np.array(seen, np.uint32), ranges, bearings)
 
 
 FORM_NAMES = {
@@ -170,11 +152,9 @@ FORM_NAMES = {
 
 
 def _forms_of(messages: Sequence[m.Measurement]) -> str:
-    kinds = [type(each) for each in messages]
-    counts = {kind: kinds.count(kind) for kind in FORM_NAMES if kind in kinds}
-    if len(counts) < 2:
-        return ""
-    return ", ".join(f"{count} of {FORM_NAMES[kind]}" for kind, count in counts.items())
+    counts: Counter[object] = Counter(map(type, messages))
+    forms = [f"{counts[kind]} of {name}" for kind, name in FORM_NAMES.items() if counts[kind]]
+    return ", ".join(forms) if len(forms) > 1 else ""
 
 
 def intervals_of(robot: str, odometry: Sequence[m.AnyOdometry], clock_offset_s: float) -> Intervals:

@@ -84,8 +84,6 @@ class RecordedWorld:
                     self._configured = message
                 case m.End():
                     self._notes = message.notes
-                case _:
-                    pass
         self._end = _ends(published)
         ordered = [*(published[place] for place in sorted(published)), *truths]
         self._waiting = deque(sorted(ordered, key=lambda each: each[0]))

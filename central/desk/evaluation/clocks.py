@@ -311,9 +311,7 @@ def _across(points: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "k 2"]:
 
 
 def _first_of_fit(
-    e: Float[np.ndarray, "k 2"],
-    J: Float[np.ndarray, "k 2 p"],
-    stretch: Int64[np.ndarray, " k"],
+    e: Float[np.ndarray, "k 2"], J: Float[np.ndarray, "k 2 p"], stretch: Int64[np.ndarray, " k"]
 ) -> tuple[float, float]:
     """First component of argmin_p of Huber's loss of e + J p, and its σ; NaN if undetermined.
 

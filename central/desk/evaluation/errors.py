@@ -143,10 +143,7 @@ def map_errors(means: Points, covariance: Covariance, truth: Points) -> MapError
 
 
 def _shape_errors(
-    means: Points,
-    covariance: Covariance,
-    truth: Points,
-    truth_from_map: Pose,
+    means: Points, covariance: Covariance, truth: Points, truth_from_map: Pose
 ) -> ShapeErrors:
     """With G = ∂(positions)/∂(x, y, θ), NEES = min_g (e − G g)ᵀ P⁻¹ (e − G g).
 
@@ -200,9 +197,7 @@ def distance_rmse(a: Points, b: Points) -> float:
 
 
 def moved_rmse(
-    motion: Pose | None,
-    points: Float[np.ndarray, "n k"],
-    truth: Float[np.ndarray, "n k"],
+    motion: Pose | None, points: Float[np.ndarray, "n k"], truth: Float[np.ndarray, "n k"]
 ) -> float | None:
     """RMS distance [m] of the first two columns after a motion, if there is one, and points."""
     if motion is None or not len(points):

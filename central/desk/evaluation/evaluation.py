@@ -292,10 +292,7 @@ def distances(
 
 
 def _map_result(
-    log: Collected,
-    message: m.FusedMap,
-    label_of: Mapping[int, int],
-    truth_from_map: Pose | None,
+    log: Collected, message: m.FusedMap, label_of: Mapping[int, int], truth_from_map: Pose | None
 ) -> MapResult:
     true = log.true_landmarks
     ids, means = translate.landmarks_of(message)

@@ -93,8 +93,6 @@ class EventDetector:
                 yield from self._map(message)
             case m.Status():
                 yield from self._status(message)
-            case _:
-                pass
 
     def _liveliness(self, message: m.Liveliness) -> Found:
         node, name = message.node, message.node.removeprefix("robot/")

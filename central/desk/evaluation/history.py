@@ -165,8 +165,6 @@ class _Gathering:
                     if figure.startswith(_COST):
                         row = message.stamp_ns, value
                         self.robot_cost[figure.removeprefix(_COST)].append(row)
-            case _:
-                pass
 
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:

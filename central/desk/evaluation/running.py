@@ -225,8 +225,6 @@ class TruthAlignment:
                 path = Path(*translate.trajectory_of(message))
                 first = int(path.stamps_ns[0]) if len(path.stamps_ns) else 0
                 self._smoothed[message.robot, message.incarnation, first] = path
-            case _:
-                pass
 
     def map_from_truth(self, fused: m.FusedMap | None) -> Pose | None:
         """Rigid motion (x [m], y [m], theta [rad]); None if undetermined.

@@ -133,7 +133,7 @@ def error_picture(evaluation: Evaluation, path: FilePath) -> bool:
     left_out = len(shown) - len(names)
     more = f" · {left_out} more robots are not drawn" if left_out else ""
     more += f" · not in the team's frame: {', '.join(outside)}" if outside else ""
-    figure.suptitle(f"{_heading(evaluation)}: pose errors and their 3σ bounds{more}")
+    figure.suptitle(f"{evaluation.title}: pose errors and their 3σ bounds{more}")
     _add_legend(figure, axes[0][0], 4)
     save(figure, path)
     return True
@@ -366,10 +366,6 @@ def _thinned(path: Path) -> Path:
     return Path(path.stamps_ns[drawn], path.poses[drawn])
 
 
-def _heading(evaluation: Evaluation) -> str:
-    return "a run" if evaluation.scenario is None else evaluation.title
-
-
 def _title(evaluation: Evaluation) -> list[str]:
     fused = evaluation.map
     second = [evaluation.method] if evaluation.method else []
@@ -386,7 +382,7 @@ def _title(evaluation: Evaluation) -> list[str]:
             )
             text += "" if fused.matching is None else f", {fused.matching.by}"
             second += [text, f"map NEES per dof {errors.nees_per_dof:.3g}"]
-    return [_heading(evaluation), " · ".join(second)]
+    return [evaluation.title, " · ".join(second)]
 
 
 BINS = 40

@@ -67,19 +67,18 @@ def _page(
     evaluation = run.evaluation
     title = escape(tables.title_of(evaluation))
     own = _sheet(tables.own_sheet(evaluation)) if tables.is_unfused(evaluation) else ""
-    robots = bool(evaluation.robots)
     sections = {
         "Map": [_image(pictures, "map", wide=False), own],
-        "Robots": [_sheet(tables.robot_sheet(evaluation)), _image(pictures, "errors")] * robots,
+        "Robots": [_sheet(tables.robot_sheet(evaluation)), _image(pictures, "errors")],
         "Landmarks": _landmarks(run),
-        "Peers": [_sheet(tables.peer_sheet(evaluation))] if evaluation.peers else [],
-        "Consistency": _consistency(run, pictures),
+        "Peers": [_sheet(tables.peer_sheet(evaluation))],
+        "Consistency": [_sheet(tables.consistency_sheet(run)), _image(pictures, "consistency")],
         "Paths": _paths(run),
         "Measurements": _measurements(run),
         "Events": _events(run),
-        "Latency": [_sheet(tables.latency_sheet(run))] if run.history.latencies else [],
+        "Latency": [_sheet(tables.latency_sheet(run))],
         "Traffic": _traffic(run),
-        "Processes": [_sheet(tables.process_sheet(processes))] if processes else [],
+        "Processes": [_sheet(tables.process_sheet(processes))],
         "Origin": _origin(run),
     }
     there = {name: text for name, of in sections.items() if (text := "\n".join(filter(None, of)))}
@@ -113,17 +112,8 @@ def _landmarks(run: Run) -> list[str]:
     evaluation = run.evaluation
     parts = [] if evaluation.association is None else [tables.score_sheet(evaluation.association)]
     changes = () if evaluation.map is None else evaluation.map.changes
-    if any(each.state != "unchanged" for each in changes):
-        parts.append(tables.change_sheet(changes))
-    parts += [tables.decision_sheet(evaluation.decisions)] if evaluation.decisions else []
+    parts += tables.change_sheet(changes), tables.decision_sheet(evaluation.decisions)
     return [*map(_sheet, parts)]
-
-
-def _consistency(run: Run, pictures: Mapping[str, Path]) -> list[str]:
-    sheet = tables.consistency_sheet(run)
-    if not sheet.rows and "consistency" not in pictures:
-        return []
-    return [_sheet(sheet), _image(pictures, "consistency")]
 
 
 def _paths(run: Run) -> list[str]:
@@ -137,8 +127,8 @@ def _measurements(run: Run) -> list[str]:
     ledger = run.ledger
     if ledger is None:
         ledgers = {n: robot.consumption.ledger for n, robot in run.evaluation.robots.items()}
-        table = _sheet(tables.disposition_sheet(ledgers)) if any(ledgers.values()) else ""
-        return [table, _note(f"As reported by the robots. The ledger: {run.no_ledger}.")]
+        reported = _note(f"As reported by the robots. The ledger: {run.no_ledger}.")
+        return [_sheet(tables.disposition_sheet(ledgers)), reported]
     robots = in_order({robot for robot, _ in ledger.entries})
     used = sum(1 for maps in ledger.maps.values() if maps)
     kind, verdict = ("good", ledger.statement())
@@ -209,6 +199,9 @@ def _note(text: str) -> str:
 
 
 def _sheet(sheet: tables.Sheet) -> str:
+    """Table with its note; nothing without rows."""
+    if not sheet.rows:
+        return ""
     note = f"\n{_note(sheet.note)}" if sheet.note else ""
     return _table(sheet.headings, sheet.rows) + note
 

@@ -127,8 +127,6 @@ class Recorded:
                 }
             case _ if channel.recomputable:
                 self.outputs[channel.name].append(RecordedOutput(sample, message))
-            case _:
-                pass
 
     def of(self, kind: type[M], *channels: ch.Channel) -> list[M]:
         """Recorded messages of a kind by channel, in log order."""

@@ -40,10 +40,7 @@ def landmarks_entity(stamp_ns: int, landmarks: Landmarks, size_m: float) -> Fiel
     """Team landmarks: dot, 95 % ellipse, number."""
     dots, names = [], []
     for (x, y), name, *axes in zip(
-        landmarks.means.tolist(),
-        landmarks.ids.tolist(),
-        *ellipses(landmarks.blocks),
-        strict=True,
+        landmarks.means.tolist(), landmarks.ids.tolist(), *ellipses(landmarks.blocks), strict=True
     ):
         dots.append(_ellipse(x, y, axes, (LANDMARK[0], 0.25)))
         dots.append(_dot(x, y, size_m, LANDMARK))

@@ -15,12 +15,7 @@ from teamslam.central.desk.evaluation.events import Event, EventDetector
 from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment, TruthFrames
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.view import foxglove_scene as fox
-from teamslam.central.desk.view.drawn import (
-    Landmarks,
-    Track,
-    centre_particles,
-    landmarks_of,
-)
+from teamslam.central.desk.view.drawn import Landmarks, Track, centre_particles, landmarks_of
 from teamslam.team.estimation.se2 import Pose, compose
 from teamslam.team.shapes import Float
 from teamslam.team.wire import channels as ch
@@ -184,8 +179,6 @@ class ViewerNode:
                 self._take_status(message)
             case m.Liveliness() if message.node.startswith("robot/"):
                 self._of(message.node.removeprefix("robot/")).lost = not message.alive
-            case _:
-                pass
 
     def _in_order(self) -> list[tuple[str, _Robot]]:
         return [(name, self._robots[name]) for name in in_order(self._robots)]

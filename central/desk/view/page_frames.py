@@ -28,11 +28,7 @@ from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
 from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment
 from teamslam.central.desk.names import data_set_of
-from teamslam.central.desk.view.drawn import (
-    Landmarks,
-    centre_particles,
-    landmarks_of,
-)
+from teamslam.central.desk.view.drawn import Landmarks, centre_particles, landmarks_of
 from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
 from teamslam.central.unnamed_landmarks import SHOWN, STEPS
 from teamslam.team.shapes import Float
@@ -197,8 +193,6 @@ class PageFrames:
                 ends = bool(message.crosses)
                 self._add_frame("path", r=message.robot, t=times, v=poses, ends=ends)
                 self._align()
-            case _:
-                pass
 
     def _add_events(self, message: m.Message) -> None:
         if isinstance(message, m.PoseEstimate | m.FusedMap):  # the world runs ahead
