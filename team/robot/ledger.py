@@ -36,7 +36,7 @@ class Ledger:
         number, disposition = measurement.number, self.used
         if rejected is not None:
             disposition = rejected.disposition
-        elif m.is_odometry(measurement):  # first: most measurements are
+        elif type(measurement) in m.ODOMETRY:  # first: most measurements are
             pass
         elif type(measurement) is m.InitialPose:
             disposition = INITIAL_POSE

@@ -45,8 +45,9 @@ class Mapper:
     """Hybrid-SLAM on one incarnation of a robot's stream after the other.
 
     Call `begin` with an initial pose, `take` for each measurement in order, and `finish`; messages
-    are appended to `out`. gated: measurements that no others of their window confirmed. now_ns: the
-    latest stamp. passed_ns: no further window ends until then.
+    are appended to `out`. gated: measurements that no others of their window confirmed. steps:
+    odometry intervals of the incarnation in this process; all_steps: of all incarnations. now_ns:
+    the latest stamp. passed_ns: no further window ends until then.
     """
 
     used = "in a submap"
@@ -71,7 +72,7 @@ class Mapper:
         self._on_disposition = on_disposition
         self._period_ns = round(config.pose_s * 1e9)
         self._offset_ns = round(config.clock_offset_s * 1e9)
-        self.gated = 0
+        self.gated = self.all_steps = 0
         self.now_ns = self.passed_ns = 0
         self._began_ns = 0
         self.writer = MessageWriter(config.id, 0, digest, started=True)
@@ -92,6 +93,7 @@ class Mapper:
 
     def _restart(self, incarnation: int, initial: InitialPose) -> None:
         self.ledger = Ledger(self.used, on_disposition=self._on_disposition)
+        self.steps = 0
         self._taking: m.Measurement | None = None
         self.forget_window()
         self.restart_estimator(incarnation, initial)
@@ -141,6 +143,8 @@ class Mapper:
         """Process the next measurement; return whether it closed a window."""
         self._taking = measurement
         if m.is_odometry(measurement):
+            self.steps += 1
+            self.all_steps += 1
             return self.drive(measurement)
         self.account(measurement, self._observe(measurement))
         return False
@@ -167,10 +171,10 @@ class Mapper:
     def drive(self, measurement: m.AnyOdometry) -> bool:
         """Process an odometry interval; return whether it closed the window."""
         outcome = self._drive(measurement)
-        rejected = BY_CORE[outcome % DUE]
         if outcome < DUE:  # most intervals
-            self.account(measurement, rejected)
+            self.account(measurement, BY_CORE[outcome])
             return False
+        rejected = BY_CORE[outcome % DUE]
         slam, before_ns = self._slam, self._slam.last_keyframe_ns
         slam.last_measurement = measurement.number
         closed = slam.advance()

@@ -38,15 +38,12 @@ from teamslam.team.wire.digest import announce_configuration
 class StreamAccount:
     """Counts of the current incarnation, and the last statements of earlier ones.
 
-    consumed: measurements; steps: odometry intervals in this process; all_steps: of all
-    incarnations. acknowledged: submaps at the centre. unreported: measurements since the last
-    report.
+    consumed: measurements. acknowledged: submaps at the centre. unreported: measurements since the
+    last report.
     """
 
     incarnation: int = 0
     consumed: int = 0
-    steps: int = 0
-    all_steps: int = 0
     acknowledged: int = 0
     unreported: int = 0
     ended: list[m.Done] = field(default_factory=list)
@@ -54,7 +51,7 @@ class StreamAccount:
     def begin(self, incarnation: int, consumed: int = 0, acknowledged: int = 0) -> None:
         """Begin an incarnation, or continue an earlier process's."""
         self.incarnation, self.consumed = incarnation, consumed
-        self.acknowledged, self.steps = acknowledged, 0
+        self.acknowledged = acknowledged
 
     def acknowledge(self, progress: m.Progress) -> None:
         """Record the number of submaps at the centre."""
@@ -164,7 +161,7 @@ class RobotNode:
         return status_of(
             self.mapper,
             "done" if self.done else "mapping" if measurements else "waiting",
-            self.account.all_steps,
+            self.mapper.all_steps,
             measurements,
             self.withheld,
             waits_for_driver=self.stream_end.waits_for_driver,
@@ -225,13 +222,15 @@ class RobotNode:
 
     def handle(self, message: m.Message) -> list[Outgoing]:
         """Process one message; its stamp is the time."""
+        inbox, end = self.inbox, self.stream_end
         if not m.is_measurement(message):
             self.receive(message)
-        elif not self.is_held and self.inbox.take(message):
+        elif not self.is_held and inbox.take(message):
             self._consume(message)
         else:
-            self.inbox.put(message)
-        self.consume()
+            inbox.put(message)
+        if inbox.ahead or inbox.later or end.last is not None or end.is_ordered:
+            self.consume()
         return self._publish() if self.out else []
 
     def receive(self, message: m.Message) -> None:
@@ -298,9 +297,6 @@ class RobotNode:
             self.account.begin(measurement.incarnation)
         account = self.account
         account.consumed = measurement.number + 1
-        if m.is_odometry(measurement):
-            account.steps += 1
-            account.all_steps += 1
         if self.mapper.take(measurement):
             self.report_progress()
         if type(measurement) is m.Sightings:
@@ -391,7 +387,7 @@ class RobotNode:
             robot=self.robot,
             incarnation=account.incarnation,
             measurements=account.consumed if last is None else min(account.consumed, last),
-            steps=account.steps,
+            steps=self.mapper.steps,
             submaps=self.submaps,
             ledger=self.ledger.entries(),
         )

@@ -200,7 +200,8 @@ class EndOfStream:
     def __init__(self, robot: str, inbox: Inbox) -> None:
         self._robot = robot
         self._inbox = inbox
-        self._last: m.StreamEnd | None = None
+        self.last: m.StreamEnd | None = None
+        """Last measurement of the stream, once its end is announced."""
         self._world_end: m.End | None = None
         self._head: m.StreamHead | None = None
         self.driver_is_there: bool | None = None
@@ -213,15 +214,15 @@ class EndOfStream:
 
         An ending live team ends the stream of an absent driver where it is.
         """
-        if self._last is None:
+        if self.last is None:
             if self.driver_is_there or not self.is_ordered:
                 return False
-            self._last = self._at(self._inbox.received)
-        return self._inbox.complete(self._last)
+            self.last = self._at(self._inbox.received)
+        return self._inbox.complete(self.last)
 
     def last_of(self, incarnation: int) -> int | None:
         """Return the number of measurements of an incarnation that has ended."""
-        last = self._last
+        last = self.last
         return last.measurements if last is not None and last.incarnation == incarnation else None
 
     @property
@@ -236,8 +237,8 @@ class EndOfStream:
 
     def _known(self) -> m.StreamEnd | None:
         head = self._head
-        if self._last is not None or head is None:
-            return self._last
+        if self.last is not None or head is None:
+            return self.last
         return m.StreamEnd(
             robot=head.robot, incarnation=head.incarnation, measurements=head.measurements
         )
@@ -276,9 +277,9 @@ class EndOfStream:
         mine = [stream for stream in end.streams if stream.robot == self._robot]
         if self.at_source is not None:  # the only authority from here on
             incarnation, count = self.at_source
-            self._last = m.StreamEnd(robot=self._robot, incarnation=incarnation, measurements=count)
+            self.last = m.StreamEnd(robot=self._robot, incarnation=incarnation, measurements=count)
             return
-        self._last = mine[0] if mine else self._at(0)
+        self.last = mine[0] if mine else self._at(0)
 
     def take_head(self, head: m.StreamHead) -> m.StreamHead:
         """Process the driver's newest head, which may end the stream or begin a later
@@ -289,8 +290,8 @@ class EndOfStream:
             return head
         if head.state == "ended":
             self.take(_end_at(head))
-        elif self._last is not None and head.incarnation > self._last.incarnation:
-            self._last = None
+        elif self.last is not None and head.incarnation > self.last.incarnation:
+            self.last = None
         return head
 
     def _at(self, measurements: int) -> m.StreamEnd:

@@ -4,12 +4,13 @@ Values are never unpacked without a type: a list of empty lists takes 75 times i
 nesting of the values of a large payload are checked before any is created.
 """
 
-from functools import cache
+import re
+from functools import cache, lru_cache
 from typing import Any, TypeVar, Union
 
 import msgspec
 
-from teamslam.team.wire.messages import BY_TAG, Message
+from teamslam.team.wire.messages import BY_TAG, NAME, Measurement, Message, PoseEstimate
 
 M = TypeVar("M", bound=Message)
 
@@ -52,15 +53,31 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
     try:
         if len(payload) > SMALL:
             check_structure(payload)
-        message: M = _decoder(expected).decode(payload)
+        message: Any = _decoder(expected).decode(payload)
     except (WireError, *_UNREADABLE) as error:
         raise _refusal(payload, expected, error) from None
+    if type(message) in _OF_ROBOTS and not _is_name(message.robot):
+        raise WireError("wrong field", f"{type(message).__name__}: {_NO_NAME}")
     try:
         message.check()
     except ValueError as error:
         reason, _, detail = str(error).partition(": ")
         raise WireError(reason, f"{type(message).__name__}.{detail}") from None
-    return message
+    valid: M = message
+    return valid
+
+
+_OF_ROBOTS = frozenset(k for k in BY_TAG.values() if issubclass(k, Measurement | PoseEstimate))
+"""Messages whose field `robot` is a `Robot`."""
+_NO_NAME = f"Expected `str` matching regex {NAME!r} - at `$[2]`"
+
+
+@lru_cache(maxsize=1024)
+def _is_name(text: str) -> bool:
+    return _NAME.fullmatch(text) is not None
+
+
+_NAME = re.compile(NAME)
 
 
 class _Head(msgspec.Struct, array_like=True):

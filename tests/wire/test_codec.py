@@ -3,7 +3,7 @@ import json
 import struct
 import time
 import tracemalloc
-from typing import Any
+from typing import Any, get_type_hints
 
 import msgpack
 import msgspec
@@ -246,6 +246,19 @@ SKEW = spd(3) + np.triu(np.ones((3, 3)), 1)
 )
 def test_an_unsound_payload_is_refused_for_its_reason(reason, payload, expected):
     assert reason_of(payload, expected) == reason
+
+
+@pytest.mark.parametrize("name", ["Not A Name", "r1\n", "", "r" * 33])
+@pytest.mark.parametrize(
+    "tag",
+    [
+        tag
+        for tag, each in EXAMPLES.items()
+        if get_type_hints(type(each), include_extras=True).get("robot") == m.Robot
+    ],
+)
+def test_a_robot_of_a_frequent_message_has_a_name(tag, name):
+    assert reason_of(with_fields(EXAMPLES[tag], robot=name)) == "wrong field"
 
 
 def test_an_error_names_the_field_and_a_payload_beyond_the_limit_is_not_read():

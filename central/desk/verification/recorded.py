@@ -58,10 +58,12 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
 
     def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement]:
         """Yield measurements begin … end − 1, up to the first gap."""
+        get = self._messages.get
         for number in range(begin, end):
-            if number not in self._messages:
+            message = get(number)
+            if message is None:
                 return
-            yield self._messages[number]
+            yield message
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from teamslam.team.wire.messages.base import (
     Message,
     Name,
     Real,
+    Robot,
     StampNs,
     Text,
     check_classes,
@@ -31,7 +32,7 @@ from teamslam.team.wire.messages.base import (
 class Measurement(Message, frozen=True, kw_only=True):
     """A measurement of a sensor stream; `number` is the robot's measurement counter."""
 
-    robot: Name
+    robot: Robot
     incarnation: Count
     number: Count
 
@@ -197,7 +198,7 @@ class Fix(Measurement, frozen=True, kw_only=True, tag="fix/1"):
 
 
 _CLASSES = frozenset(Measurement.__subclasses__())
-_OF_ODOMETRY = frozenset({Odometry, Increment, Steering})
+ODOMETRY = frozenset({Odometry, Increment, Steering})
 
 
 def is_measurement(message: Message) -> TypeGuard[Measurement]:
@@ -207,7 +208,7 @@ def is_measurement(message: Message) -> TypeGuard[Measurement]:
 
 def is_odometry(message: Message) -> TypeGuard[AnyOdometry]:
     """Return whether a message is an odometry interval, as fast as `is_measurement`."""
-    return type(message) in _OF_ODOMETRY
+    return type(message) in ODOMETRY
 
 
 class StreamEnd(msgspec.Struct, frozen=True, kw_only=True, array_like=True):

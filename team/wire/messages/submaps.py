@@ -25,6 +25,7 @@ from teamslam.team.wire.messages.base import (
     Message,
     Name,
     Real,
+    Robot,
     StampNs,
     Text,
     check_classes,
@@ -214,7 +215,7 @@ class PoseEstimate(Message, frozen=True, kw_only=True, tag="pose/1"):
     outside the team's frame is the own pose and withdraws the poses before it.
     """
 
-    robot: Name
+    robot: Robot
     incarnation: Count
     sequence: Count
     map_digest: Digest
