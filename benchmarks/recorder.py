@@ -24,8 +24,6 @@ from teamslam.sim.scenarios.scenario import dumps, load, with_options
 from teamslam.team.recording.check import check_log
 from teamslam.team.recording.reader import open_log
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests import build
@@ -53,24 +51,11 @@ def publish(endpoint: str, team: str, robots: Sequence[str], hz: float, seconds:
                 time.sleep(wait)
             for robot in robots:
                 values = rng.uniform(1.0, 10.0, LANDMARKS)
-                head = {"stamp_ns": k * period_ns, "robot": robot, "incarnation": 1}
+                head = {"stamp_ns": k * period_ns, "robot": robot}
+                seen = {"ids": range(LANDMARKS), "ranges": values, "bearings": values / 10.0}
                 for channel, message in (
-                    (
-                        ch.ODOMETRY,
-                        m.Odometry(
-                            **head, number=2 * k, duration_ns=period_ns, forward=0.5, yaw_rate=0.1
-                        ),
-                    ),
-                    (
-                        ch.OBSERVATIONS,
-                        m.Observations(
-                            **head,
-                            number=2 * k + 1,
-                            ids=from_ids(range(LANDMARKS)),
-                            ranges=from_floats(values),
-                            bearings=from_floats(values / 10.0),
-                        ),
-                    ),
+                    (ch.ODOMETRY, build.odometry(**head, number=2 * k, duration_ns=period_ns)),
+                    (ch.OBSERVATIONS, build.observations(**head, number=2 * k + 1, **seen)),
                 ):
                     bus.publish(Outgoing(channel, robot, message))
                     key = channel.key(robot)

@@ -47,37 +47,29 @@ def hash_of(name: str, tmp_path: Path, *command: str, runs_by: Sequence[str] = (
     return " ".join(ran.stdout.split())
 
 
-@COMPILED
-@pytest.mark.parametrize("flags", [("-O1",), ("-O3",), ("-O3", "-mavx2")], ids=" ".join)
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_gcc_gives_the_same_bits_at_every_level(name, flags, tmp_path):
-    if shutil.which("g++") is None:
-        pytest.skip("g++ is not on the path")
-    if "-mavx2" in flags and "avx2" not in Path("/proc/cpuinfo").read_text():
-        pytest.skip("this processor has no AVX2")
-    assert hash_of(name, tmp_path, "g++", *flags) == PROGRAMS[name][0]
+COMPILERS = {
+    "gcc -O1": ("g++", "-O1"),
+    "gcc -O3": ("g++", "-O3"),
+    "gcc avx2": ("g++", "-O3", "-mavx2"),
+    "clang": (sys.executable, "-m", "ziglang", "c++", "-O3", "-mcpu=x86_64_v2"),
+    "arm": ("aarch64-linux-gnu-g++", "-O3", "-static"),
+}
+"""clang comes from the ziglang wheel; Debian: apt install g++-aarch64-linux-gnu qemu-user, whose
+base has fused multiply-add."""
 
 
 @COMPILED
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_clang_gives_the_bits_of_gcc(name, tmp_path):
-    """clang comes from the ziglang wheel."""
-    if find_spec("ziglang") is None:
+def test_each_compiler_at_each_level_gives_the_same_bits(name, compiler, tmp_path):
+    command, runs_by = COMPILERS[compiler], ["qemu-aarch64"] if compiler == "arm" else []
+    if any(shutil.which(each) is None for each in (command[0], *runs_by)):
+        pytest.skip(f"{' or '.join((command[0], *runs_by))} is not on the path")
+    if compiler == "clang" and find_spec("ziglang") is None:
         pytest.skip("ziglang is not installed: pip install --no-deps -r hashes-zig.txt")
-    clang = (sys.executable, "-m", "ziglang", "c++")
-    found = hash_of(name, tmp_path, *clang, "-O3", "-mcpu=x86_64_v2")
-    assert found == PROGRAMS[name][0]
-
-
-@COMPILED
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_an_arm_processor_gives_the_bits_of_an_intel(name, tmp_path):
-    """Debian: apt install g++-aarch64-linux-gnu qemu-user. Its base has fused multiply-add."""
-    compiler, emulator = map(shutil.which, ("aarch64-linux-gnu-g++", "qemu-aarch64"))
-    if compiler is None or emulator is None:
-        pytest.skip("a compiler for aarch64 and qemu-user are not on the path")
-    found = hash_of(name, tmp_path, compiler, "-O3", "-static", runs_by=[emulator])
-    assert found == PROGRAMS[name][0]
+    if compiler == "gcc avx2" and "avx2" not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("this processor has no AVX2")
+    assert hash_of(name, tmp_path, *command, runs_by=runs_by) == PROGRAMS[name][0]
 
 
 def test_no_library_holds_a_fused_multiply_add():

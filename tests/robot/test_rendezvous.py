@@ -11,12 +11,14 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
+from tests import build
 from tests.sim.reruns import written
 from tests.teams import Team, driven, of, published
 from tests.test_sighted_team import CENTRE, SCENARIO, STREAMS
 
 CONFIG = SCENARIO.robots[0]
 MEASUREMENTS = published(STREAMS.streams[0])
+FIRST = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
 
 
 def at_rendezvous(scenario: Scenario) -> Scenario:
@@ -52,41 +54,31 @@ def sent_by(measurements: list[m.Message], exchange: str = "rendezvous", end: bo
 
 
 def test_nothing_is_sent_until_a_teammate_is_seen_and_then_all_of_it():
-    first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
-    before = sent_by(MEASUREMENTS[:first], end=False)
-    there = sent_by(MEASUREMENTS[: first + 1], end=False)
-    held = of(sent_by(MEASUREMENTS[:first], "continuous", end=False), ch.SUBMAP)
+    before = sent_by(MEASUREMENTS[:FIRST], end=False)
+    there = sent_by(MEASUREMENTS[: FIRST + 1], end=False)
+    held = of(sent_by(MEASUREMENTS[:FIRST], "continuous", end=False), ch.SUBMAP)
     assert held
     assert of(before, ch.SUBMAP) == of(before, ch.RENDEZVOUS) == []
     assert of(there, ch.SUBMAP) == held
     (told,) = of(there, ch.RENDEZVOUS)
-    assert told.teammates == MEASUREMENTS[first].teammates
+    assert told.teammates == MEASUREMENTS[FIRST].teammates
     assert told.submaps == len(held)
-    assert told.waited_s == pytest.approx(1e-9 * (MEASUREMENTS[first].stamp_ns - held[0].stamp_ns))
+    assert told.waited_s == pytest.approx(1e-9 * (MEASUREMENTS[FIRST].stamp_ns - held[0].stamp_ns))
 
 
 def test_who_is_told_that_it_was_seen_sends_too_and_nobody_else():
-    first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
     for teammates, count in (((CONFIG.id,), 1), (("r9",), 0)):
         node = RobotNode(CONFIG, "rendezvous")
-        driven(node, MEASUREMENTS[:first], end=False)
-        seen = m.Rendezvous(
-            stamp_ns=MEASUREMENTS[first].stamp_ns,
-            robot="r2",
-            incarnation=1,
-            teammates=teammates,
-            submaps=0,
-            waited_s=0.0,
-        )
-        out = node.handle(seen)
+        driven(node, MEASUREMENTS[:FIRST], end=False)
+        named = {"stamp_ns": MEASUREMENTS[FIRST].stamp_ns, "robot": "r2", "teammates": teammates}
+        out = node.handle(build.built(m.Rendezvous, waited_s=0.0, **named))
         assert (len(of(out, ch.SUBMAP)) > 0) == (len(of(out, ch.RENDEZVOUS)) == 1) == bool(count)
         if count:
             assert of(out, ch.RENDEZVOUS)[0].teammates == ()
 
 
 def test_a_held_submap_holds_back_the_team_time_that_its_robot_has_passed():
-    first = next(k for k, r in enumerate(MEASUREMENTS) if isinstance(r, m.Sightings))
-    reports = of(sent_by(MEASUREMENTS[:first], end=False), ch.ROBOT_PROGRESS)
+    reports = of(sent_by(MEASUREMENTS[:FIRST], end=False), ch.ROBOT_PROGRESS)
     assert {report.submaps for report in reports} == {0}
     assert max(report.stamp_ns for report in reports) <= MEASUREMENTS[0].stamp_ns
 

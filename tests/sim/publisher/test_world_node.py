@@ -153,16 +153,8 @@ def test_a_recorder_that_comes_late_is_waited_for_until_it_has_what_can_be_had(m
         assert node.unrecorded == 0, "who is not there is not waited for"
 
 
-def wanted(node, robot="r1", incarnation=1, first=0, last=-1):
-    return list(
-        node.measurements(
-            encoded(
-                build.measurements_request(
-                    robot=robot, incarnation=incarnation, first=first, last=last
-                )
-            )
-        )
-    )
+def wanted(node, **fields):
+    return list(node.measurements(encoded(build.measurements_request(**fields))))
 
 
 def test_what_is_asked_for_is_answered_with_the_bytes_that_were_published():
