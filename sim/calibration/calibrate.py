@@ -67,7 +67,7 @@ class Calibration:
 def calibrate_models(
     worlds: Sequence[tuple[str, WorldStreams]], scenario: Scenario, progress: Progress
 ) -> Calibration:
-    """Calibrate from all worlds (label, streams), starting from the scenario's models; raises
+    """Calibrate from all worlds (label, streams), from the scenario's models; raises
     CalibrationError.
     """
     stretches = moving_stretches(stream for _, world in worlds for stream in world.streams)

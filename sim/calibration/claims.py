@@ -1,8 +1,8 @@
 """Compare measurement covariances and the sensor mount with the truth.
 
 A factor is the median squared Mahalanobis error over the median of chi-square, for odometry over
-spans, since the reference's own error dominates single intervals. Of mount heading and
-`bearing_offset` only the sum is observable.
+spans, since the reference's own error dominates intervals. Mount heading and `bearing_offset` are
+observable as a sum only.
 """
 
 from collections.abc import Mapping, Sequence

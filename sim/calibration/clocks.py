@@ -55,8 +55,8 @@ class Clock:
 
 
 def clocks_of(data: Sequence[Reference], sensor: Sensor) -> dict[str, Clock]:
-    """Clocks of robots with enough measurements on a known path; a robot that turns before driving
-    has unknown speeds.
+    """Clocks of robots with enough measurements on a known path, but those that turn before
+    driving.
     """
 
     def fit(part: Sequence[Reference]) -> Mapping[str, float]:

@@ -94,7 +94,7 @@ def factor_by_cost(
 ) -> Figure | None:
     """Factor, at least 1, at which the joint cost equals its degrees of freedom; σ from χ².
 
-    Covers errors that differ between windows only. Landmarks are associated anew for each factor.
+    Covers errors that differ between windows. Landmarks are associated anew for each factor.
     """
     factor = central.covariance_factor
     for _ in range(MOST_ROUNDS):
@@ -111,10 +111,9 @@ def factor_by_cost(
 def landmark_sigma(
     teams: Sequence[tuple[Fold, Mapping[int, Float[np.ndarray, "2"]]]], central: CentralConfig
 ) -> Figure | None:
-    """σ [m] with Σ χ²(σ) = Σ dof of the maps' shape errors, for P + σ² I.
+    """σ [m] with Σ χ²(σ) = Σ dof of the maps' shape errors, for P + σ² I; 0 if P suffices.
 
-    Standard deviation: half the range of Σ χ² = Σ dof ± √(2 Σ dof). None without a shape; 0 if P
-    suffices.
+    Standard deviation: half the range of Σ χ² = Σ dof ± √(2 Σ dof).
     """
     settings = replace(join_settings(central), landmark_sigma=0.0)
     maps = []
@@ -153,9 +152,8 @@ def _shape_chi2(
 
 
 def _normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | None:
-    """Covariance scale of consistent data: geometric mean over the worlds.
-
-    Standard deviation from their scatter, or the monitor's for one.
+    """Covariance scale of consistent data: geometric mean over the worlds, σ from their scatter, or
+    the monitor's.
     """
     settings = join_settings(central)
     scales, sigmas = [], []
@@ -193,9 +191,7 @@ def disagreements(fold: Fold, settings: JoinSettings) -> list[_Disagreement]:
 def _separate_robot(
     island: Island, robot: str, starts: Mapping[Stream, InitialPoseFactor], settings: JoinSettings
 ) -> tuple[Graph, Island]:
-    """One robot's map beside the others', its landmarks numbered from APART, from the joined
-    solution.
-    """
+    """One robot's map beside the others', its landmarks numbered from APART."""
     submaps = island.graph.submaps
     id_of = {node: id_ for id_, node in island.graph.landmarks.items()}
     numbers = {

@@ -23,8 +23,8 @@ FASTEST_TURN_RAD_S = 3.0  # turn rate above which a path has an interpolation fa
 class Reference:
     """One robot's measurements, with reference poses and landmarks.
 
-    name: world label and robot id. gap_ns: longest interpolated gap of `path`. turns_first: turn,
-    then drive straight between poses, not an arc.
+    name: world label and robot id. gap_ns: longest interpolated gap of `path`. turns_first: the
+    path turns, then drives straight.
     """
 
     name: str
@@ -117,8 +117,8 @@ def poses_at(
 
     At a share s of the arc from (p, θ) to (p', θ + φ) the pose is
         (p + s sinc(sφ/2)/sinc(φ/2) R((s − 1)φ/2) (p' − p), θ + sφ);
-    with turns_first a chord with the final heading. Unknown: outside the path, in a gap longer than
-    gap_ns, or beside a heading jump.
+    with turns_first a chord with the final heading. Unknown: outside the path, in a gap, or beside
+    a heading jump.
     """
     if len(path.stamps_ns) < 2:
         return np.zeros((len(stamps_ns), 3)), np.zeros(len(stamps_ns), dtype=np.bool_)

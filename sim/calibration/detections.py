@@ -1,11 +1,10 @@
 """Calibrate clutter and miss rates from detections without identities.
 
-Each window is associated anew (`teamslam.team.estimation.association`). After a landmark's first
-detection, each scan that covers its place is a trial: of n trials, v detections are binomial with
-detection probability p; clutter recurs by chance with probability g. The clutter share, p and g
-maximise the likelihood (expectation and maximisation). A scan covers a place within the range and
-bearing span of the other landmarks it detected. Claimed covariances are compared with the smoothed
-windows' cost, whose mean is one per degree of freedom.
+Each window is associated anew. After a landmark's first detection, each scan that covers its place
+is a trial: of n trials, v detections are binomial with detection probability p; clutter recurs with
+probability g. The clutter share, p and g maximise the likelihood (expectation and maximisation). A
+scan covers a place within the range and bearing span of its other landmarks. Claimed covariances
+are compared with the smoothed windows' cost, whose mean is one per degree of freedom.
 """
 
 from collections.abc import Sequence
@@ -48,8 +47,8 @@ UNITS = {
 class _WindowLooks(NamedTuple):
     """Repeated detections in a window.
 
-    trials, again: per landmark, scans that cover its place after its first detection, and
-    detections among them. area [m²]: view area times scans.
+    trials, again: per landmark, covering scans after its first detection, and detections among
+    them. area [m²]: view area times scans.
     """
 
     trials: Int64[np.ndarray, " L"]

@@ -74,7 +74,7 @@ def jackknife(
 def leave_out_groups(
     fit: Fit[T], groups: Sequence[Sequence[T]], units: Mapping[str, str]
 ) -> tuple[Figure, ...]:
-    """Fit all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)² (Efron and Stein
+    """Fit all groups, with σ² = (G − 1)/G Σ (fit without a group − their mean)² (Efron, Stein
     1981).
     """
     values = fit([part for group in groups for part in group])

@@ -52,10 +52,9 @@ class JoinedTeam:
 def join_team(
     world: WorldStreams, scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 ) -> JoinedTeam:
-    """Join every robot's windows; main island only.
+    """Join every robot's windows; main island only; raises CalibrationError without submaps.
 
-    Between window ends a path is the particle mean, moved to end at the joined pose. Raises
-    CalibrationError without submaps.
+    Between window ends a path is the particle mean, moved to end at the joined pose.
     """
     tracks = {}
     for each in world.streams:

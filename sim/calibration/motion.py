@@ -137,7 +137,7 @@ def fit_motion(
     """Fit the model of `increment_of`, with errors over SPAN_S; raises CalibrationError.
 
     slow_below [m/s]: fit the scale below that speed, too. Alternates weighted least squares of the
-    scales under Huber's loss with the likelihood of densities σ² = per_m² |d| + per_rad² |φ|.
+    scales under Huber's loss with the likelihood of σ² = per_m² |d| + per_rad² |φ|.
     """
     spans = _spans(data)
     moving = np.abs(spans.speed).mean(axis=1) * SPAN_S > LEAST_WAY_M

@@ -25,8 +25,8 @@ def scenario_text(
 ) -> str:
     """Text of `output`: the user's scenario, or a built-in base, with the figures.
 
-    Common figures replace all robots' values, except figures of single robots. All robots are named
-    if one has figures of its own.
+    Common figures replace all robots' values, except their own. All robots are named if one has own
+    figures.
     """
     document = _document_of(start, calibration) if own is None else own_document(own)
     world = document.get("world", {})

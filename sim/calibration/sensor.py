@@ -213,9 +213,9 @@ def _lens(rows: _Rows, offset: float) -> list[float]:
 def fit_sensor(data: Sequence[Reference], *, depth: bool = False) -> Mapping[str, float]:
     """Fit the likeliest `Sensor`; raises CalibrationError.
 
-    Constants are those of all robots together; noise is of residuals under each robot's own: σ² =
-    σ₀² + (σ₁ d)² by likelihood, for bearings the median absolute deviation. White shares and times
-    T fit ρ(τ) = (1 − white) exp(−τ/T) to one landmark's error correlation.
+    Constants are of all robots; noise of residuals under each robot's own: σ² = σ₀² + (σ₁ d)² by
+    likelihood, for bearings the median absolute deviation. White shares and times T fit ρ(τ) = (1 −
+    white) exp(−τ/T) to one landmark's error correlation.
     """
     common = constants(data, depth=depth)
     parts = []

@@ -46,9 +46,8 @@ class Origin:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Text cells by column; lines: file line of each row, from 1.
-
-    name: for errors. Methods that convert raise DatasetError.
+    """Text cells by column, with the file line of each row; methods that convert raise
+    DatasetError.
     """
 
     name: str
@@ -177,8 +176,8 @@ class CsvTable:
 def read_table(file: File, name: str, known: Sequence[str] | None = None) -> CsvTable:
     """Read a table with a header line; skip empty lines and lines with `#`; raises DatasetError.
 
-    known: allowed columns, in either case. Columns may be separated by ; or tabs, decimals then by
-    commas. An unnamed first column that counts rows is omitted.
+    known: allowed columns, in either case. Separators may be ; or tabs, decimals then commas. An
+    unnamed first column that counts rows is omitted.
     """
     try:
         text = file.read_bytes().decode("utf-8-sig")

@@ -44,7 +44,7 @@ class PointEdge:
 class FactorGraph:
     """Edges in the order of the file, and vertices.
 
-    poses, landmarks: initial values, or true ones. priors: initial poses with covariance, None:
+    poses, landmarks: initial values, or true ones. priors: initial poses with covariance; None:
     exact. unused: counts of lines by keyword.
     """
 
@@ -64,9 +64,7 @@ class FactorGraph:
         return tuple(sorted({edge.start[0] for edge in self.pose_edges}))
 
     def chain(self, robot: str) -> tuple[list[Key], list[PoseEdge]]:
-        """A robot's poses by number, and the odometry edges between neighbours; raises
-        DatasetError.
-        """
+        """A robot's poses by number, and the odometry edges between them; raises DatasetError."""
         keys = {key for e in self.pose_edges for key in (e.start, e.end) if key[0] == robot}
         keys |= {edge.pose for edge in self.point_edges if edge.pose[0] == robot}
         ordered = sorted(keys)
@@ -126,8 +124,7 @@ def _place_point(pose: Pose, point: Point) -> Point:
 def streams_of_graph(graph: FactorGraph) -> WorldStreams:
     """Measurements of robots r1, r2, …; raises DatasetError.
 
-    The first robot starts at its prior, its first vertex, or the origin; the others at their
-    priors.
+    The first robot starts at its prior, its first vertex, or the origin; others at their priors.
     """
     if not graph.point_edges:
         raise DatasetError(

@@ -1,4 +1,4 @@
-"""A data set in a folder or zip of CSV tables, a sub-folder for each robot (docs/your_data.md)."""
+"""A data set of CSV tables in a folder or zip (docs/your_data.md)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,10 +14,10 @@ from teamslam.sim.datasets.csv_table import (
     read_table,
 )
 from teamslam.sim.datasets.detections_table import detections_of, merge_detections
-from teamslam.sim.datasets.folder_files import EXPECTED, name_table, open_folder, unused_files
+from teamslam.sim.datasets.folder_files import name_table, open_folder, unused_files
 from teamslam.sim.datasets.folder_odometry import intervals_of
 from teamslam.sim.datasets.tables import DatasetError, File
-from teamslam.sim.world.config import FolderWorld, starts_unknown
+from teamslam.sim.world.config import FolderWorld
 from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.shapes import Int64
@@ -53,11 +53,8 @@ def folder(
 ) -> WorldStreams:
     """Read these robots' measurements; raises DatasetError.
 
-    classes: names of detections' classes. Odometry stamps are shifted by clock_offset_s, which the
-    robot corrects.
+    classes: of detections. Odometry stamps are shifted by clock_offset_s, which the robot corrects.
     """
-    if not world.path:
-        raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
     clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
     with open_folder(world.path) as (root, folders):
         missing = [name for name in clocks if name not in folders]
@@ -66,7 +63,7 @@ def folder(
                 f"{world.path}: no robot {', '.join(missing)} in it, but {', '.join(folders)}: "
                 "give --robots, or a scenario with its names"
             )
-        streams = [_stream(name, folders[name], world, clocks, classes) for name in clocks]
+        streams = [_stream(name, folders[name], clocks, classes) for name in clocks]
         surveyed = _table(root, "landmarks", "")
         unused = unused_files(root, folders, TABLES)
     if world.duration_s is not None:
@@ -94,13 +91,12 @@ def folder(
 
 
 def _stream(
-    robot: str, place: File, world: FolderWorld, clocks: Mapping[str, int], classes: Sequence[str]
+    robot: str, place: File, clocks: Mapping[str, int], classes: Sequence[str]
 ) -> RobotStream:
     kinds = ("odometry", "observations", "sightings", "fixes", "truth", "start")
     tables = {kind: _table(place, kind, robot) for kind in kinds}
     unnamed = detections_of(place, robot, classes)
-    stream = stream_of(robot, tables, tuple(clocks), clocks[robot], unnamed)
-    return replace(stream, start=None) if starts_unknown(world, robot) else stream
+    return stream_of(robot, tables, tuple(clocks), clocks[robot], unnamed)
 
 
 def stream_of(

@@ -43,9 +43,8 @@ def intervals_of(table: CsvTable | None, offset_ns: int) -> tuple[Intervals, lis
 
     Speeds, and a car's wheel speed and steering, hold from t_s to the next row; with duration_s
     they are means over the time that ends at t_s. Poses are at t_s; an increment spans from the
-    previous row to t_s. A covariance is of the row's motion (a pose's: since the previous row), for
-    an error in the frame of its end; speeds with one become increments. With duration_s, speed and
-    increment rows may be mixed.
+    previous row to t_s. A covariance is of the row's motion, for an error in the frame of its end;
+    speeds with one become increments. With duration_s, speed and increment rows may be mixed.
     """
     if table is None:
         none = np.empty(0, np.int64)
@@ -253,9 +252,7 @@ def _judge_speeds(
 
 
 def _usual_maximum(rate: Float[np.ndarray, " N"], seconds: Float[np.ndarray, " N"]) -> float:
-    """Mean yaw rate [rad/s] that LEAST_WHIRLS and a share WHIRLS of stretches of 1 s reach,
-    whatever single rows and jitter are. NaN rates count as 0.
-    """
+    """Mean yaw rate [rad/s] that LEAST_WHIRLS and a share WHIRLS of stretches of 1 s reach."""
     ends = np.append(0.0, np.cumsum(seconds))
     stretches = min(int(ends[-1]), len(rate))
     if stretches < LEAST_WHIRLS:

@@ -286,8 +286,8 @@ def truth_of(
 def _are_degrees(poses: Float[np.ndarray, "N 3"]) -> bool:
     """Whether headings θ follow the directions δ of the path's chords in degrees.
 
-    Concentration: |mean of exp(2i(δ − θ))|, 1 for driving forward or backward, at any constant
-    offset. Degrees must explain twice as much as θ = 0, which small angles are.
+    Concentration: |mean of exp(2i(δ − θ))|, at any constant offset. Degrees must explain twice as
+    much as θ = 0, which small angles are.
     """
     if len(poses) < LEAST_CHORDS:
         return False

@@ -25,7 +25,7 @@ from teamslam.sim.datasets.factor_graph import (
 )
 from teamslam.sim.datasets.tables import LARGEST, DatasetError
 from teamslam.sim.datasets.unlabelled import pieces
-from teamslam.sim.world.config import GraphWorld, starts_unknown
+from teamslam.sim.world.config import GraphWorld
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import UNNAMED
 from teamslam.team.shapes import Float
@@ -45,8 +45,6 @@ def robot_count(path: str) -> int:
 
 def graph_world(world: GraphWorld, robots: int) -> WorldStreams:
     """Streams of the file's robots, or of pieces of its only one; raises DatasetError."""
-    if not world.path:
-        raise DatasetError(f"no data set given: name it with --dataset FILE; {EXPECTED}")
     found = streams_of_graph(_read(world.path))
     streams = found.streams
     if world.duration_s is not None:
@@ -64,10 +62,7 @@ def graph_world(world: GraphWorld, robots: int) -> WorldStreams:
         raise DatasetError(
             f"{world.path}: {len(streams)} robots are in it, {robots} asked for: leave --robots out"
         )
-    known = (
-        replace(each, start=None) if starts_unknown(world, each.robot) else each for each in streams
-    )
-    return replace(found, streams=tuple(known))
+    return replace(found, streams=streams)
 
 
 def _read(path: str) -> FactorGraph:

@@ -1,7 +1,7 @@
 """A data set of one robot whose landmarks have no names (docs/landmarks_without_names.md).
 
-A step is taken as 1 s. Labels, reference and GPS are for scoring: no estimator sees them, except
-the GPS with `world.fixes`.
+A step is taken as 1 s. Labels, reference and GPS are for scoring, but for the GPS with
+`world.fixes`.
 """
 
 from dataclasses import replace
@@ -58,12 +58,9 @@ def is_car(path: str | Path) -> bool:
 
 
 def unlabelled(world: UnlabelledWorld, robots: int) -> WorldStreams:
-    """Streams of a data set, cut into one piece per robot; raises DatasetError.
-
-    Pieces begin at one time here.
+    """Streams of a data set, cut into one piece per robot, which begin at one time; raises
+    DatasetError.
     """
-    if not world.path:
-        raise DatasetError(f"no data set given: name it with --dataset FOLDER; {EXPECTED}")
     root = Path(world.path)
     lacking = [name for name in FILES if not (root / name).is_file()]
     if lacking:

@@ -25,7 +25,7 @@ from teamslam.sim.datasets.tables import (
     optional_table,
     table,
 )
-from teamslam.sim.world.config import UtiasWorld, starts_unknown
+from teamslam.sim.world.config import UtiasWorld
 from teamslam.sim.world.streams import Intervals, RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
@@ -75,8 +75,6 @@ def utias(world: UtiasWorld, robots: Sequence[RobotConfig]) -> WorldStreams:
     clock_offset_s, which the robot corrects. Stamps are nanoseconds since 1970. The initial pose is
     the truth at the first measurement, with the world's start sigmas.
     """
-    if not world.path:
-        raise DatasetError(f"no data set given: name it with --dataset or world.path; {EXPECTED}")
     with open_data_set(world.path, "Barcodes.dat") as files:
         clocks = {robot.id: round(robot.clock_offset_s * 1e9) for robot in robots}
         return _streams(world, clocks, files)
@@ -211,7 +209,7 @@ def _stream(robot: str, read: _Reading) -> RobotStream:
     return RobotStream(
         robot=robot,
         start_ns=start_ns,
-        start=_start(read.world, robot, start),
+        start=_start(read.world, start),
         intervals=intervals,
         landmark_detections=seen.where(seen.ids > read.last_robot).grouped(),
         teammate_detections=replace(teammates, ids=index).grouped(),
@@ -223,8 +221,8 @@ def _stream(robot: str, read: _Reading) -> RobotStream:
     )
 
 
-def _start(world: UtiasWorld, robot: str, pose: Float[np.ndarray, "3"] | None) -> StartPose | None:
-    if pose is None or starts_unknown(world, robot):
+def _start(world: UtiasWorld, pose: Float[np.ndarray, "3"] | None) -> StartPose | None:
+    if pose is None:
         return None
     if world.start_sigma_m == 0.0:
         return StartPose(pose, None)
@@ -302,8 +300,7 @@ def _start_pose(
 ) -> Float[np.ndarray, "3"] | None:
     """True pose at start_ns, interpolated on the circle, or None.
 
-    Resampled truth has wrong headings beside ±π: only samples that agree with the most central one
-    count.
+    Resampled truth has wrong headings beside ±π: only samples near the most central one count.
     """
     first, last = np.searchsorted(
         truth_ns, [start_ns - START_WINDOW_NS, start_ns + START_WINDOW_NS + 1]

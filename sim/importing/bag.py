@@ -127,8 +127,8 @@ def _proposed(bag: Bag, robot: str | None) -> Proposal:
 
 
 def _spaces(topics: list[Topic], tagged: set[str], bases: dict[str, str]) -> list[str] | list[None]:
-    """Namespaces that are robots; None: all topics are one robot's, as none has both odometry and
-    detections, and all odometry has one frame.
+    """Namespaces that are robots; None: all topics are one robot's, without a namespace that has
+    odometry and detections, and with one odometry frame.
     """
     spaces = sorted({_namespace(name) for name in bases})
     if len(spaces) < 2:

@@ -56,11 +56,11 @@ def import_files(
     everyones: Collection[str] = (),
     places: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[RobotTables, list[str]]:
-    """Import one robot's tables by a map; also returns notes.
+    """Import one robot's tables by a map; also returns notes; raises DatasetError.
 
     everyones: file names of all robots; a table whose files only other robots have is omitted.
-    places: place of each kind's table in the map. Raises DatasetError, also for an unused file that
-    is probably an omitted table.
+    places: place of each kind's table in the map. An unused file that is probably an omitted table
+    is an error.
     """
     tables = RobotTables(robot)
     notes: list[str] = []

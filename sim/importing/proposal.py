@@ -106,9 +106,9 @@ Drops = Mapping[str, Mapping[str, Drop]]  # by robot and file
 def propose_map(robots: Mapping[str, Files], *, own: bool = False, drops: Drops = _NONE) -> str:
     """Propose a TOML map for the files of each robot.
 
-    A table that not all robots have alike, with `own` every table, is `[robots.NAME.KIND]`. One
-    file is the truth of one robot. A robot without odometry has the file that it should have. The
-    rest is comments.
+    A table that not all robots have alike, with `own` every table, is `[robots.NAME.KIND]`. A file
+    is the truth of one robot. A robot without odometry gets the expected file. The rest is
+    comments.
     """
     found = {robot: _tables(files) for robot, files in robots.items()}
     _drop_shared_truth(robots, found, drops)
@@ -255,7 +255,7 @@ def split_by_robot(files: Files) -> dict[str, Files]:
     """Files of each robot by the first or last words of their names; empty for fewer than two.
 
     A robot has odometry and measurements; beside one, a name with one of both in a file called
-    alike is enough. Other files with a robot's name are its own; the rest is every robot's.
+    alike is enough. Files without a robot's name are every robot's.
     """
     for position in (0, -1):
         words = {name: _words(name)[position] for name in files}

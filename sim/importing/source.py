@@ -455,8 +455,8 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def check_sources(robots: Iterable[RobotTables]) -> None:
-    """Convert the users' tables as a data set's are, so that the first fault names file, line and
-    entry of the map.
+    """Convert the users' tables as a data set's are: the first fault names file, line and map
+    entry.
     """
     for robot in robots:
         tables = {kind: table for kind, table in robot.sources.items() if len(table)}

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ import msgspec
 from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_files import robots_of, scenario_in
 from teamslam.sim.datasets.graph import graph_world
-from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
+from teamslam.sim.datasets.kinds import FORMATS, UTIAS_MARKER, kind_of
+from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.tables import open_data_set as open_files
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
 from teamslam.sim.datasets.utias import ROBOTS, present_robots, utias
@@ -23,6 +25,7 @@ from teamslam.sim.world.config import (
     SimulatedWorld,
     UnlabelledWorld,
     UtiasWorld,
+    starts_unknown,
 )
 from teamslam.sim.world.identities import Hiding, with_hidden_identities
 from teamslam.sim.world.simulator import simulate
@@ -53,7 +56,14 @@ def streams_of(scenario: Scenario) -> WorldStreams:
         hiding = Hiding(tagged, world.missed, world.clutter, world.visible_to_m)
         hides = world.identities == "hidden" or world.missed > 0.0
         return with_hidden_identities(streams, hiding, seed) if hides else streams
+    if not world.path:
+        raise DatasetError(f"no data set given: name it with --dataset or world.path; {FORMATS}")
     streams = READERS[type(world)](world, scenario)
+    known = (
+        replace(each, start=None) if starts_unknown(world, each.robot) else each
+        for each in streams.streams
+    )
+    streams = replace(streams, streams=tuple(known))
     hides = world.identities == "hidden" and not isinstance(world, UnlabelledWorld)
     return with_hidden_identities(streams, Hiding(), scenario.seed) if hides else streams
 

@@ -14,7 +14,7 @@ from teamslam.team.config import GATE, UNNAMED, Sensor
 from teamslam.team.core import mean_direction
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian, PoseGaussian
-from teamslam.team.shapes import Float, Int64
+from teamslam.team.shapes import Bool, Float, Int64
 
 
 @dataclass(frozen=True)
@@ -63,102 +63,90 @@ def filter_step(state: FastSlamMl, step: RobotStep, generator: np.random.Generat
     moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
     poses = state.poses + np.column_stack((moved, drawn[:, 2]))
     state = _make_room(replace(state, poses=poses), len(step.ids))
-    scan = _Scan(state)
+    state = replace(
+        state,
+        logs=state.logs.copy(),
+        means=state.means.copy(),
+        covariances=state.covariances.copy(),
+        seen=state.seen.copy(),
+        counts=state.counts.copy(),
+    )
+    free, took = np.ones(state.seen.shape, np.bool_), [state.took]
     for r, b in zip(step.ranges.tolist(), step.bearings.tolist(), strict=True):
-        scan.take(r, b, step.sensor)
-    return _resample(scan.state(), generator)
+        took.append(_assign(state, free, r, b, step.sensor)[:, None])
+    state = replace(state, logs=state.logs - state.logs.max(), took=np.hstack(took))
+    return _resample(state, generator)
 
 
-class _Scan:
-    def __init__(self, state: FastSlamMl) -> None:
-        self._state = state
-        self._logs = state.logs.copy()
-        self._means, self._covariances = state.means.copy(), state.covariances.copy()
-        self._seen, self._counts = state.seen.copy(), state.counts.copy()
-        self._free = np.ones(state.seen.shape, np.bool_)
-        self._took: list[Int64[np.ndarray, " M"]] = []
+def _assign(
+    state: FastSlamMl, free: Bool[np.ndarray, "M C"], r: float, b: float, sensor: Sensor
+) -> Int64[np.ndarray, " M"]:
+    """Assign a detection in each particle, in place, to its likeliest free or a new landmark."""
+    x, y, heading = state.poses.T
+    particles = np.arange(len(x))
+    dx, dy = state.means[..., 0] - x[:, None], state.means[..., 1] - y[:, None]
+    q = np.maximum(dx * dx + dy * dy, 1e-12)
+    range_ = np.sqrt(q)
+    H = np.stack((np.stack((dx / range_, dy / range_), -1), np.stack((-dy / q, dx / q), -1)), -2)
+    R = np.diag(
+        [
+            core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * r),
+            core.squared(sensor.bearing_sigma),
+        ]
+    )
+    S = dense.product(dense.product(H, state.covariances), H.transpose(0, 1, 3, 2)) + R
+    turned = b - core.atan2(dy, dx) + heading[:, None]
+    off = np.stack((r - range_, np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi), -1)
+    determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
+    squared = (
+        S[..., 1, 1] * core.squared(off[..., 0])
+        - 2.0 * S[..., 0, 1] * off[..., 0] * off[..., 1]
+        + S[..., 0, 0] * core.squared(off[..., 1])
+    ) / determinant
+    likely = -0.5 * squared - 0.5 * core.log(determinant) - core.log(2.0 * np.pi)
+    used = np.arange(state.means.shape[1]) < state.counts[:, None]
+    likely = np.where(used & free & (squared < GATE), likely, -np.inf)
+    best = likely.argmax(axis=1)
+    edge = -0.5 * GATE - 0.5 * core.log(np.linalg.det(R)) - core.log(2.0 * np.pi)
+    old = likely[particles, best] > edge
+    state.logs[:] += np.where(old, likely[particles, best], edge)
+    place = np.where(old, best, state.counts)
+    _update(state, particles[old], best[old], H, S, off)
+    _add(state, particles[~old], place[~old], (r, b), R)
+    free[particles, place] = False
+    state.seen[particles, place] += 1
+    return place
 
-    def take(self, r: float, b: float, sensor: Sensor) -> None:
-        """Assign a detection in each particle to its likeliest free landmark, or a new one."""
-        x, y, heading = self._state.poses.T
-        particles = np.arange(len(x))
-        dx, dy = self._means[..., 0] - x[:, None], self._means[..., 1] - y[:, None]
-        q = np.maximum(dx * dx + dy * dy, 1e-12)
-        range_ = np.sqrt(q)
-        H = np.stack(
-            (np.stack((dx / range_, dy / range_), -1), np.stack((-dy / q, dx / q), -1)), -2
-        )
-        R = np.diag(
-            [
-                core.squared(sensor.range_sigma) + core.squared(sensor.range_sigma_per_m * r),
-                core.squared(sensor.bearing_sigma),
-            ]
-        )
-        S = dense.product(dense.product(H, self._covariances), H.transpose(0, 1, 3, 2)) + R
-        turned = b - core.atan2(dy, dx) + heading[:, None]
-        off = np.stack((r - range_, np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi), -1)
-        determinant = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] * S[..., 1, 0]
-        squared = (
-            S[..., 1, 1] * core.squared(off[..., 0])
-            - 2.0 * S[..., 0, 1] * off[..., 0] * off[..., 1]
-            + S[..., 0, 0] * core.squared(off[..., 1])
-        ) / determinant
-        likely = -0.5 * squared - 0.5 * core.log(determinant) - core.log(2.0 * np.pi)
-        used = np.arange(self._means.shape[1]) < self._counts[:, None]
-        likely = np.where(used & self._free & (squared < GATE), likely, -np.inf)
-        best = likely.argmax(axis=1)
-        edge = -0.5 * GATE - 0.5 * core.log(np.linalg.det(R)) - core.log(2.0 * np.pi)
-        old = likely[particles, best] > edge
-        self._logs += np.where(old, likely[particles, best], edge)
-        place = np.where(old, best, self._counts)
-        self._update(particles[old], best[old], H, S, off)
-        self._found(particles[~old], place[~old], (r, b), R)
-        self._free[particles, place] = False
-        self._seen[particles, place] += 1
-        self._took.append(place)
 
-    def _update(
-        self,
-        at: Int64[np.ndarray, " k"],
-        place: Int64[np.ndarray, " k"],
-        H: Float[np.ndarray, "M C 2 2"],
-        S: Float[np.ndarray, "M C 2 2"],
-        off: Float[np.ndarray, "M C 2"],
-    ) -> None:
-        P, J = self._covariances[at, place], H[at, place]
-        gain = dense.solve(S[at, place], dense.product(J, P)).transpose(0, 2, 1)
-        self._means[at, place] += np.einsum("kij,kj->ki", gain, off[at, place])
-        after = P - dense.product(dense.product(gain, J), P)
-        self._covariances[at, place] = 0.5 * (after + after.transpose(0, 2, 1))
+def _update(
+    state: FastSlamMl,
+    at: Int64[np.ndarray, " k"],
+    place: Int64[np.ndarray, " k"],
+    H: Float[np.ndarray, "M C 2 2"],
+    S: Float[np.ndarray, "M C 2 2"],
+    off: Float[np.ndarray, "M C 2"],
+) -> None:
+    P, J = state.covariances[at, place], H[at, place]
+    gain = dense.solve(S[at, place], dense.product(J, P)).transpose(0, 2, 1)
+    state.means[at, place] += np.einsum("kij,kj->ki", gain, off[at, place])
+    after = P - dense.product(dense.product(gain, J), P)
+    state.covariances[at, place] = 0.5 * (after + after.transpose(0, 2, 1))
 
-    def _found(
-        self,
-        at: Int64[np.ndarray, " k"],
-        place: Int64[np.ndarray, " k"],
-        measured: tuple[float, float],
-        R: Float[np.ndarray, "2 2"],
-    ) -> None:
-        r, b = measured
-        x, y, heading = self._state.poses[at].T
-        s, c = core.sin_and_cos(heading + b)
-        G = np.stack((np.stack((c, -r * s), -1), np.stack((s, r * c), -1)), -2)
-        self._means[at, place] = np.column_stack((x + r * c, y + r * s))
-        self._covariances[at, place] = dense.product(dense.product(G, R), G.transpose(0, 2, 1))
-        self._counts[at] += 1
 
-    def state(self) -> FastSlamMl:
-        took = self._state.took
-        if self._took:
-            took = np.column_stack((took, *self._took))
-        return replace(
-            self._state,
-            logs=self._logs - self._logs.max(),
-            means=self._means,
-            covariances=self._covariances,
-            seen=self._seen,
-            counts=self._counts,
-            took=took,
-        )
+def _add(
+    state: FastSlamMl,
+    at: Int64[np.ndarray, " k"],
+    place: Int64[np.ndarray, " k"],
+    measured: tuple[float, float],
+    R: Float[np.ndarray, "2 2"],
+) -> None:
+    r, b = measured
+    x, y, heading = state.poses[at].T
+    s, c = core.sin_and_cos(heading + b)
+    G = np.stack((np.stack((c, -r * s), -1), np.stack((s, r * c), -1)), -2)
+    state.means[at, place] = np.column_stack((x + r * c, y + r * s))
+    state.covariances[at, place] = dense.product(dense.product(G, R), G.transpose(0, 2, 1))
+    state.counts[at] += 1
 
 
 def _make_room(state: FastSlamMl, more: int) -> FastSlamMl:

@@ -1,8 +1,7 @@
 """Mappers of comparison robots."""
 
-from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,32 +26,36 @@ from teamslam.team.pairs import FEEDBACK, NEEDS_MAP, PAIRS
 from teamslam.team.rejection import BY_CORE, UNMEASURED, Rejection
 from teamslam.team.robot.mapper import Mapper
 from teamslam.team.robot.maps import InitialPose
-from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Outgoing
 
 JOINT_LANDMARKS = 2000  # landmarks beyond which a map has only 2 × 2 covariances
 
 
-class MapExchange:
-    """Rounds of one robot.
+class ExchangingMapper(Mapper):
+    """Hybrid-SLAM that sends its own map in exchanges, or to viewers.
 
     lockstep: the robot waits for answers. answered, awaited: last answered and last sent round.
-    last: its sequence; −1: none.
+    last_map: its sequence; −1: none.
     """
 
-    def __init__(self, config: RobotConfig, warnings: deque[str]) -> None:
-        self.exchanges = PAIRS[config.estimator, config.fusion] == "own/map"
+    joint = True
+
+    def __init__(self, config: RobotConfig, *options: Any) -> None:
+        super().__init__(config, *options)
+        self._exchanges = PAIRS[config.estimator, config.fusion] == "own/map"
         self.lockstep = config.fusion in FEEDBACK
-        self._warnings = warnings
-        self._every_ns = config.exchange_s * 1e9
         self._map_ns: int | None = None
         self._sent_ns: int | None = None
         self.answered = self.awaited = 0
-        self.last = -1
+        self.last_map = -1
+
+    def begin(self, start: m.InitialPose) -> None:
+        """Begin an incarnation, whose maps are numbered from 0."""
+        super().begin(start)
+        self.last_map = -1
 
     @property
-    def waits(self) -> bool:
+    def waits_for_answer(self) -> bool:
         """Whether a sent map has no answer yet."""
         return self.lockstep and self.awaited > self.answered
 
@@ -63,73 +66,32 @@ class MapExchange:
         self.answered = round_
         return True
 
-    def is_sent(self, stamp_ns: int) -> bool:
-        """Record a new map; return whether to send it."""
-        self._map_ns = stamp_ns
-        since = None if self._sent_ns is None else stamp_ns - self._sent_ns
-        return not self.exchanges or since is None or since >= self._every_ns
-
-    @property
-    def unsent_ns(self) -> int | None:
-        """Stamp of the last map, if no exchange had it."""
-        is_new = self.exchanges and self._map_ns != self._sent_ns
-        return self._map_ns if is_new else None
-
-    def message(
-        self,
-        stamp_ns: int,
-        sequence: int,
-        landmarks: LandmarkGaussian,
-        writer: MessageWriter,
-        *,
-        joint: bool,
-    ) -> Outgoing:
-        """Make a map's message, which may open a round."""
-        if self.exchanges:
-            self._sent_ns, self.last = stamp_ns, sequence
-            self.awaited = self.answered + 1 if self.lockstep else self.awaited
-        joint = joint and self.exchanges
-        if joint and len(landmarks.ids) > JOINT_LANDMARKS:
-            joint = False
-            self._warnings.append("the own map is too large for a joint covariance")
-        return writer.own_map(
-            stamp_ns, sequence, self.awaited, landmarks, "joint" if joint else "blocks"
-        )
-
-
-class ExchangingMapper(Mapper):
-    """Hybrid-SLAM that sends its own map in exchanges, or to viewers."""
-
-    joint = True
-
-    def __init__(self, config: RobotConfig, *options: Any) -> None:
-        super().__init__(config, *options)
-        self.exchange = MapExchange(config, self.warnings)
-
-    def begin(self, start: m.InitialPose) -> None:
-        """Begin an incarnation, whose maps are numbered from 0."""
-        super().begin(start)
-        self.exchange.last = -1
-
     def is_map_due(self, start_ns: int, end_ns: int) -> bool:
         """Whether a map is due at the end of this window."""
-        return self.exchange.exchanges or super().is_map_due(start_ns, end_ns)
+        return self._exchanges or super().is_map_due(start_ns, end_ns)
 
     def publish_map(self, stamp_ns: int) -> None:
         """Publish the running map, for viewers or a due exchange."""
-        if self.exchange.is_sent(stamp_ns):
+        self._map_ns = stamp_ns
+        since = None if self._sent_ns is None else stamp_ns - self._sent_ns
+        if not self._exchanges or since is None or since >= self.config.exchange_s * 1e9:
             self._send_map(stamp_ns)
 
     def publish_last_map(self) -> None:
         """Publish the stream's last map, unless an exchange had it."""
-        if self.exchange.unsent_ns is not None:
-            self._send_map(self.exchange.unsent_ns)
+        if self._exchanges and self._map_ns is not None and self._map_ns != self._sent_ns:
+            self._send_map(self._map_ns)
 
     def _send_map(self, stamp_ns: int) -> None:
         landmarks = self.own_landmarks()
-        message = self.exchange.message(
-            stamp_ns, self.sequence, landmarks, self.writer, joint=self.joint
-        )
+        if self._exchanges:
+            self._sent_ns, self.last_map = stamp_ns, self.sequence
+            self.awaited = self.answered + 1 if self.lockstep else self.awaited
+        form: Literal["joint", "blocks"] = "joint" if self.joint and self._exchanges else "blocks"
+        if form == "joint" and len(landmarks.ids) > JOINT_LANDMARKS:
+            form = "blocks"
+            self.warnings.append("the own map is too large for a joint covariance")
+        message = self.writer.own_map(stamp_ns, self.sequence, self.awaited, landmarks, form)
         self.out.append(message)
 
     @property

@@ -48,7 +48,7 @@ class ExchangingRobot(RobotNode):
                 super().receive(message)
 
     def _absorb(self, fused: m.FusedMap) -> None:
-        if not self.mapper.exchange.take_answer(fused.exchange):
+        if not self.mapper.take_answer(fused.exchange):
             return
         ids, means = translate.landmarks_of(fused)
         joint = translate.landmark_covariance_of(fused)
@@ -62,13 +62,13 @@ class ExchangingRobot(RobotNode):
         """Whether it waits for a known map, or for a centre, which may still answer if it was never
         present.
         """
-        waits = self.mapper.exchange.waits and not self._centre_is_away
+        waits = self.mapper.waits_for_answer and not self._centre_is_away
         return self.mapper.waits_for_map or waits
 
     def consume(self) -> None:
         """Consume in order; a waiting robot reports what it received."""
         super().consume()
-        if not self.mapper.exchange.lockstep or not self.is_held:
+        if not self.mapper.lockstep or not self.is_held:
             return
         received = self.inbox.received
         if received - self.progress().measurements >= product.PROGRESS_MEASUREMENTS:
@@ -85,7 +85,7 @@ class ExchangingRobot(RobotNode):
 
     def statement(self) -> m.Done:
         """The account of the incarnation, with its last map's sequence."""
-        return msgspec.structs.replace(super().statement(), last_map=self.mapper.exchange.last)
+        return msgspec.structs.replace(super().statement(), last_map=self.mapper.last_map)
 
     def _close_incarnation(self) -> None:
         super()._close_incarnation()
