@@ -3,12 +3,12 @@
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from teamslam.sim.world.streams import Detections, grouped
+from teamslam.sim.world.streams import Detections, grouped, rows_of
 from teamslam.team.shapes import Bool, Float, Int64, UInt32
 
 LARGEST = 4e9  # largest number of a data set: the time of the year 2096
@@ -134,9 +134,7 @@ class Scans:
 
     def where(self, chosen: Bool[np.ndarray, " R"]) -> "Scans":
         """Chosen rows."""
-        columns = {field.name: getattr(self, field.name) for field in fields(self)}
-        given = {name: values[chosen] for name, values in columns.items() if values is not None}
-        return replace(self, **given)
+        return rows_of(self, chosen)
 
     def grouped(self) -> Detections:
         """One message per stamp and form."""

@@ -6,10 +6,14 @@ time.
 """
 
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from teamslam.team.shapes import Bool, Float, Int64, UInt8, UInt32
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 START = 0
 OBSERVATIONS = 1
@@ -17,6 +21,15 @@ SIGHTINGS = 2
 FIXES = 3
 ODOMETRY = 4
 NO_LABEL = 2**32 - 1  # identity of clutter, or of an unknown landmark
+
+
+R = TypeVar("R", bound="DataclassInstance")
+
+
+def rows_of(record: R, chosen: np.ndarray) -> R:
+    """Chosen rows of every array of a dataclass."""
+    arrays = {name: each for name, each in vars(record).items() if isinstance(each, np.ndarray)}
+    return replace(record, **{name: each[chosen] for name, each in arrays.items()})
 
 
 @dataclass(frozen=True)
@@ -60,15 +73,7 @@ class Intervals:
 
     def where(self, chosen: Bool[np.ndarray, " I"]) -> "Intervals":
         """Chosen intervals."""
-        return Intervals(
-            self.end_ns[chosen],
-            self.duration_ns[chosen],
-            self.forward[chosen],
-            self.yaw_rate[chosen],
-            self.steered,
-            None if self.increments is None else self.increments[chosen],
-            None if self.covariances is None else self.covariances[chosen],
-        )
+        return rows_of(self, chosen)
 
 
 COLUMNS = ("ids", "ranges", "bearings", "points", "covariances", "signatures", "classes")

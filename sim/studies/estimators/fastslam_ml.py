@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.sim.world.streams import rows_of
 from teamslam.team import core
 from teamslam.team.config import GATE, UNNAMED, Sensor
 from teamslam.team.core import mean_direction
@@ -63,14 +64,7 @@ def filter_step(state: FastSlamMl, step: RobotStep, generator: np.random.Generat
     moved = np.column_stack((c * drawn[:, 0] - s * drawn[:, 1], s * drawn[:, 0] + c * drawn[:, 1]))
     poses = state.poses + np.column_stack((moved, drawn[:, 2]))
     state = _make_room(replace(state, poses=poses), len(step.ids))
-    state = replace(
-        state,
-        logs=state.logs.copy(),
-        means=state.means.copy(),
-        covariances=state.covariances.copy(),
-        seen=state.seen.copy(),
-        counts=state.counts.copy(),
-    )
+    state = rows_of(state, np.arange(len(poses)))  # copies, which are changed in place
     free, took = np.ones(state.seen.shape, np.bool_), [state.took]
     for r, b in zip(step.ranges.tolist(), step.bearings.tolist(), strict=True):
         took.append(_assign(state, free, r, b, step.sensor)[:, None])
@@ -173,16 +167,7 @@ def _resample(state: FastSlamMl, generator: np.random.Generator) -> FastSlamMl:
         return state
     at = (np.arange(m) + generator.random()) / m
     chosen = np.minimum(np.searchsorted(np.cumsum(weights), at), m - 1)
-    return replace(
-        state,
-        poses=state.poses[chosen],
-        logs=np.zeros(m),
-        means=state.means[chosen],
-        covariances=state.covariances[chosen],
-        seen=state.seen[chosen],
-        counts=state.counts[chosen],
-        took=state.took[chosen],
-    )
+    return replace(rows_of(state, chosen), logs=np.zeros(m))
 
 
 def slots_of_detections(state: FastSlamMl) -> Int64[np.ndarray, " N"]:
