@@ -112,8 +112,9 @@ def measurements_of(
     rows = Rows(table, thing)
     if driven is not None:
         _check_clock(rows, driven)
+    measured = (cells for name, cells in rows.table.columns.items() if name != "t_s")
     empty_ns = rows.take_out(
-        ~np.array([any(cells[1:]) for cells in _cells(rows.table)], dtype=np.bool_)
+        ~np.array([any(cells) for cells in zip(*measured, strict=True)], dtype=np.bool_)
     )
     column = "landmark" if team is None else "teammate"
     if team is not None:
@@ -161,11 +162,6 @@ def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
             f"odometry, {begin_ns * 1e-9:.3f} to {end_ns * 1e-9:.3f} s; all tables of a team have "
             "one clock: put them on it by a map of columns (offset, scale)",
         )
-
-
-def _cells(table: CsvTable) -> list[tuple[str, ...]]:
-    columns = [table.columns["t_s"], *(c for name, c in table.columns.items() if name != "t_s")]
-    return list(zip(*columns, strict=True))
 
 
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:

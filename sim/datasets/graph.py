@@ -69,7 +69,8 @@ def _read(path: str) -> FactorGraph:
     first = _first_line(Path(path)) if Path(path).is_file() else None
     if first is None:
         raise DatasetError(f"{path}: no such file, or not a graph; {EXPECTED}")
-    return read_pyfg(Path(path)) if _is_pyfg(first) else read_graph(Path(path))
+    is_pyfg = any(SYMBOL.fullmatch(word) for word in first.words[:3])
+    return read_pyfg(Path(path)) if is_pyfg else read_graph(Path(path))
 
 
 POSES = ("VERTEX_SE2", "VERTEX2")
@@ -243,10 +244,6 @@ PYFG_FORMS = {
     "EDGE_SE2_XY": _Form(3, (5,), "time pose landmark x y and three numbers of the covariance"),
 }
 SYMBOL = re.compile("([A-Za-z]+)([0-9]{1,10})")
-
-
-def _is_pyfg(line: _Line) -> bool:
-    return any(SYMBOL.fullmatch(word) for word in line.words[:3])
 
 
 def read_pyfg(path: Path) -> FactorGraph:

@@ -36,10 +36,6 @@ PART_WORDS = (*FUSED_WORDS, *WHEEL_WORDS, "base")
 SAMPLED_MESSAGES = 2000  # number of /tf messages searched for tags
 
 
-class _UndecidedError(DatasetError):
-    """Ambiguous topics; the text has a remedy."""
-
-
 class Proposal(NamedTuple):
     """Topics of each robot; others: further possible odometry; warnings: ambiguities."""
 
@@ -65,7 +61,7 @@ def propose_assignment(path: Path) -> str:
 def _decide_topics(bag: Bag, path: Path, robot: str | None) -> Topics:
     found = _proposed(bag, robot)
     if found.warnings:
-        raise _UndecidedError(_question(path, bag, found))
+        raise DatasetError(_question(path, bag, found))
     return Topics(robots=found.robots)
 
 
@@ -166,7 +162,8 @@ def _candidates(
 ) -> tuple[list[str], list[str], list[str]]:
     """Odometry (likeliest first), detections, truth; space None: all."""
     here = [topic for topic in topics if space is None or _namespace(topic.name) == space]
-    true = [topic.name for topic in here if _is_truth(topic) and topic.kind in (*ODOMETRY, *POSES)]
+    placed = [topic.name for topic in here if topic.kind in (*ODOMETRY, *POSES)]
+    true = [name for name in placed if has_word(name, TRUTH_WORDS)]
     odometry = [t.name for t in here if t.kind in ODOMETRY and t.name not in true]
     odometry.sort(
         key=lambda name: (has_word(name, FUSED_WORDS), not has_word(name, WHEEL_WORDS), name)
@@ -175,10 +172,6 @@ def _candidates(
     detections = [t.name for t in here if t.kind in READERS and t.kind not in other]
     detections += [t.name for t in here if t.name in tagged]
     return odometry, detections, true
-
-
-def _is_truth(topic: Topic) -> bool:
-    return has_word(topic.name, TRUTH_WORDS)
 
 
 def _namespace(topic: str) -> str:
@@ -261,14 +254,14 @@ def _check_present(topics: Topics, bag: Bag, path: Path) -> None:
         for name, robot in topics.robots.items():
             topic = getattr(robot, role)
             if topic and of.setdefault(topic, name) != name:
-                raise _UndecidedError(
+                raise DatasetError(
                     f"{path}: {topic} is the {role} of both {of[topic]} and {name}: in the file of "
                     "topics (--ros2 FILE) give it to its robot alone"
                 )
     for name, robot in topics.robots.items():
         for topic in (robot.odometry, *robot.detections, robot.fixes, robot.truth):
             if topic and topic not in present:
-                raise _UndecidedError(
+                raise DatasetError(
                     f"{path}: no topic {topic}, which {name} is to have; there are:\n"
                     + _listing(bag.topics)
                 )
@@ -301,7 +294,7 @@ def _translated(bag: Bag, topics: Topics, path: Path) -> Report:
                 tables[name].take(measured)
     questions = [text for each in translators.values() if (text := each.question())]
     if questions:
-        raise _UndecidedError(f"{path}: {questions[0]}")
+        raise DatasetError(f"{path}: {questions[0]}")
     notes = [
         f"{topic}: {count} of {seen[topic]} messages dropped: damaged (first: {first[topic]})"
         for topic, count in sorted(damaged.items())

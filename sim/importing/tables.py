@@ -228,7 +228,7 @@ class RobotTables:
         place.mkdir(parents=True, exist_ok=True)
         for table, rows in self.rows.items():
             columns = self.columns[table]
-            fitted = (_fit_row(row, len(columns)) for row in rows)
+            fitted = ([*row, *[""] * (len(columns) - len(row))] for row in rows)
             write_table(
                 (folder if table == "landmarks" else place) / f"{table}.csv", columns, fitted
             )
@@ -247,7 +247,3 @@ class Report:
     messages: int = 0
     tables: Sequence[RobotTables] = ()
     datum: Datum | None = None
-
-
-def _fit_row(row: Row, width: int) -> Row:
-    return [*row, *[""] * (width - len(row))]

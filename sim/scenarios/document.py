@@ -57,7 +57,7 @@ def check_fields(value: object, declared: Any, at: str) -> None:
         tag = declared.__struct_config__.tag_field
         for name, part in value.items():
             if name != tag:
-                check_known(name, [known for known in types if _here(known, at)], at)
+                check_known(name, [x for x in types if not at or x not in TOP_LEVEL], at)
                 if name == "bearing_sigma":
                     _check_radians(part, f"{at}.{name}" if at else name)
                 check_fields(part, types[name], f"{at}.{name}" if at else name)
@@ -131,10 +131,6 @@ def _value_at(path: str, of: object) -> object:
 
 def _is_struct(declared: Any) -> bool:
     return isinstance(declared, type) and issubclass(declared, msgspec.Struct)
-
-
-def _here(name: str, at: str) -> bool:
-    return not at or name not in TOP_LEVEL
 
 
 if TYPE_CHECKING:

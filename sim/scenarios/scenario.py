@@ -197,12 +197,9 @@ def _of_folder(
     if count is not None and count > len(names):
         has = f"{Path(path).resolve().name} has {len(names)}: {', '.join(names)}"
         raise ScenarioError(f"--robots {count}: {has}; give at most as many, or none")
-    return _present(robots, names), names
-
-
-def _present(robots: Sequence[Fields], names: Sequence[str]) -> list[Fields]:
     chosen = [robot for robot in robots if robot["id"] in names]
-    return chosen or [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
+    repeated = [robots[i % len(robots)] | {"id": name} for i, name in enumerate(names)]
+    return chosen or repeated, names
 
 
 def dumps(scenario: Scenario) -> str:

@@ -6,14 +6,11 @@ time.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from teamslam.team.shapes import Bool, Float, Int64, UInt8, UInt32
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 START = 0
 OBSERVATIONS = 1
@@ -23,13 +20,14 @@ ODOMETRY = 4
 NO_LABEL = 2**32 - 1  # identity of clutter, or of an unknown landmark
 
 
-R = TypeVar("R", bound="DataclassInstance")
+R = TypeVar("R")
 
 
 def rows_of(record: R, chosen: np.ndarray) -> R:
     """Chosen rows of every array of a dataclass."""
     arrays = {name: each for name, each in vars(record).items() if isinstance(each, np.ndarray)}
-    return replace(record, **{name: each[chosen] for name, each in arrays.items()})
+    taken: R = replace(cast(Any, record), **{name: each[chosen] for name, each in arrays.items()})
+    return taken
 
 
 @dataclass(frozen=True)

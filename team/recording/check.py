@@ -114,8 +114,8 @@ def _by_arrival(counters: Int64[np.ndarray, " n"]) -> list[Life]:
     for place, counter in enumerate(counters.tolist()):
         at = len(present) - 1
         if counter in present[at]:
-            lacking = (k for k in reversed(range(at)) if _lacks(present[k], counter))
-            at = next(lacking, at + 1)
+            earlier = ((k, present[k]) for k in reversed(range(at)))
+            at = next((k for k, x in earlier if counter < x.last and counter not in x), at + 1)
         if at == len(present):
             present.append(IntervalSet())
             places.append([])
@@ -123,10 +123,6 @@ def _by_arrival(counters: Int64[np.ndarray, " n"]) -> list[Life]:
         places[at].append(place)
     arrays = [np.array(each, np.int64) for each in places]
     return [each[np.argsort(counters[each], kind="stable")] for each in arrays]
-
-
-def _lacks(present: IntervalSet, counter: int) -> bool:
-    return counter < present.last and counter not in present
 
 
 def match_totals(published: Sequence[int], totals: Sequence[int]) -> list[tuple[int, int | None]]:
@@ -281,8 +277,9 @@ class _Evidence:
         found = [*self._gaps(), *self._other_findings()]
         yield from sorted(found, key=lambda each: ch.VIEW.owner(each.where) is not None)
         named = {each.where for each in found}
-        for note in self.last_word:
-            if note.startswith(MISSING) and _key_of_note(note) not in named:
+        for note in self.last_word:  # as `missing: view/map: 20–22`
+            key = note.removeprefix(MISSING).partition(": ")[0]
+            if note.startswith(MISSING) and key not in named:
                 yield Finding("recorder", note)
 
     def _gaps(self) -> Iterator[Finding]:
@@ -306,11 +303,6 @@ class _Evidence:
             yield from self.killed()
             if self.channels & _OF_AN_END and not self.channels & _TOTALS:
                 yield Finding(ch.END.key(), NO_END)
-
-
-def _key_of_note(note: str) -> str:
-    """Key in a recorder's note `missing: view/map: 20–22`."""
-    return note.removeprefix(MISSING).partition(": ")[0]
 
 
 _FINAL = {ch.FINAL_MAP, ch.TEAM_FINAL}

@@ -62,10 +62,6 @@ def _points(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
     return (2 * index[:, None] + np.arange(2)).ravel()
 
 
-def _entries(index: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " j"]:
-    return np.concatenate([np.arange(3), 3 + _points(index)])
-
-
 def _by_id(
     ids: UInt32[np.ndarray, " L"],
     mean: Float[np.ndarray, " n"],
@@ -73,6 +69,6 @@ def _by_id(
 ) -> WholeMap:
     if (ids[1:] < ids[:-1]).any():
         order = np.argsort(ids)
-        place = _entries(order)
+        place = np.concatenate([np.arange(3), 3 + _points(order)])
         ids, mean, covariance = ids[order], mean[place], covariance[np.ix_(place, place)]
     return WholeMap(ids, mean, 0.5 * (covariance + covariance.T))

@@ -80,25 +80,24 @@ def _few_figures(runs: list[Figures]) -> Figures:
     excluded = [of_run["excluded"] for of_run in minima]
     beyond = [_is_beyond(run) for run in runs]
     bad = [any(each) for each in zip(wrong, excluded, beyond, strict=True)]
+    alarmed = [
+        any(not any(words in text for words in WIDE) for text in run["reasons"]) for run in runs
+    ]
     return figures | {
         "aligned_median": middle(run["rmse_aligned"] for run in runs),
         "joined": sum(not run["not_joined"] for run in runs) / len(runs),
         "warned": sum(warned),
         "wrong": sum(wrong),
-        "silent": sum(
-            is_so and not has_warned for is_so, has_warned in zip(wrong, warned, strict=True)
-        ),
+        "silent": _count_without(wrong, warned),
         "excluded": sum(excluded),
         "beyond": sum(beyond),
-        "beyond_silent": sum(
-            is_so and not has_warned for is_so, has_warned in zip(beyond, warned, strict=True)
-        ),
-        "alarms": sum(_alarmed(run) and not is_so for is_so, run in zip(bad, runs, strict=True)),
+        "beyond_silent": _count_without(beyond, warned),
+        "alarms": _count_without(alarmed, bad),
     }
 
 
-def _alarmed(run: Figures) -> bool:
-    return any(not any(words in text for words in WIDE) for text in run["reasons"])
+def _count_without(marks: list[bool], others: list[bool]) -> int:
+    return sum(mark and not other for mark, other in zip(marks, others, strict=True))
 
 
 def _is_beyond(run: Figures) -> bool:

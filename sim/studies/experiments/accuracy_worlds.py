@@ -116,23 +116,20 @@ def _worlds(options: Options) -> list[World]:
 def _cells(options: Options) -> dict[str, dict[str, list[Task]]]:
     return {
         world.scenario: {
-            pair_name(estimator, fusion): [
-                team_task(
-                    with_options(
-                        load(world.scenario), seed=seed, estimator=estimator, fusion=fusion
-                    ),
-                    batch=world.batch and (estimator, fusion) == OURS,
-                )
-                for seed in options.seeds[: _most(world, estimator, fusion)]
+            pair_name(*pair): [
+                _task(world, pair, seed)
+                for seed in options.seeds[: world.most_seeds if pair == OURS else OTHERS_SEEDS]
             ]
-            for estimator, fusion in (PAIRS if world.rules else [OURS])
+            for pair in (PAIRS if world.rules else [OURS])
         }
         for world in _worlds(options)
     }
 
 
-def _most(world: World, estimator: str, fusion: str) -> int:
-    return world.most_seeds if (estimator, fusion) == OURS else OTHERS_SEEDS
+def _task(world: World, pair: tuple[str, str], seed: int) -> Task:
+    estimator, fusion = pair
+    scenario = with_options(load(world.scenario), seed=seed, estimator=estimator, fusion=fusion)
+    return team_task(scenario, batch=world.batch and pair == OURS)
 
 
 def _goals(world: World, figures: Figures) -> list[Goal]:

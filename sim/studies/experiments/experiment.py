@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from importlib import metadata
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
@@ -20,6 +19,7 @@ from platform import python_version
 from typing import Any, Protocol, runtime_checkable
 
 from teamslam.team import core
+from teamslam.team.recording.provenance import version
 
 _PLACE = re.compile(r"^([a-z_][\w.]*):[A-Za-z_]\w*$")
 """A name in a table of `teamslam.team.registry`."""
@@ -114,18 +114,11 @@ def program_of(module: str) -> str:
     digest = hashlib.blake2b(digest_size=8)
     digest.update(f"python {python_version()}\n".encode())
     for library in LIBRARIES:
-        digest.update(f"{library} {_version(library)}\n".encode())
+        digest.update(f"{library} {version(library)}\n".encode())
     for name, source in sorted(_sources_of(module, ROOTS).items()):
         digest.update(f"{name}\n".encode() + source)
     digest.update(core.digest.encode())
     return digest.hexdigest()
-
-
-def _version(library: str) -> str:
-    try:
-        return metadata.version(library)
-    except metadata.PackageNotFoundError:
-        return "none"
 
 
 UTIAS_SOURCE = (

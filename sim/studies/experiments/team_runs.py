@@ -324,11 +324,12 @@ def table_of(
     title: str, first: str, figures: Mapping[str, Figures], shown: Shown, note: str = ""
 ) -> Table:
     """Table with a row for each set of figures."""
-    rows = tuple((name, *_cells_of(of_row, shown)) for name, of_row in figures.items())
+
+    def cell(of_row: Figures, name: str, form: str) -> str:
+        return "–" if of_row.get(name) is None else form.format(of_row[name])
+
+    rows = tuple(
+        (name, *(cell(of_row, figure, form) for figure, _, form in shown))
+        for name, of_row in figures.items()
+    )
     return Table(title, (first, *(heading for _, heading, _ in shown)), rows, note)
-
-
-def _cells_of(figures: Figures, shown: Shown) -> list[str]:
-    return [
-        "–" if figures.get(name) is None else form.format(figures[name]) for name, _, form in shown
-    ]

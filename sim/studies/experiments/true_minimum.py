@@ -307,14 +307,11 @@ def final_fold(
         if value is not None:
             ticks.add_start(value)
         for sequence, submap in sorted(log.submaps().get(stream, {}).items()):
-            taken = submap if has_biases else _without_biases(submap)
+            none = {} if has_biases else {"biases": (), "sensitivity": b"", "curvature": b""}
+            taken = msgspec.structs.replace(submap, **none)
             ticks.add_submap(taken, b"", sightings.get((*stream, sequence), ()))
     ticks.fold_until(float("inf"))
     return solve_fold(ticks.fold, replace(ticks.settings, robust=is_robust))
-
-
-def _without_biases(submap: m.Submap) -> m.Submap:
-    return msgspec.structs.replace(submap, biases=(), sensitivity=b"", curvature=b"")
 
 
 def compare_minima(
