@@ -83,10 +83,7 @@ def profile_graph(
     robust_c: float | None,
     sigmas: BiasSigmas,
 ) -> Any:
-    """Make all factors.
-
-    The Cauchy loss of scale c is on √(χ²/2) of each measurement.
-    """
+    """Make all factors. The Cauchy loss of scale c is on √(χ²/2) of each measurement."""
     graph = path_graph(gtsam, chains, poses)
     loss = None if robust_c is None else math.sqrt(2.0) * robust_c
     for c, chain in enumerate(chains):

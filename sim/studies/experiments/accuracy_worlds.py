@@ -87,10 +87,7 @@ def outcome(options: Options, results: Results) -> Outcome:
 
 
 def world_figures(runs: Mapping[str, Sequence[Figures]]) -> dict[str, Figures]:
-    """Figures of each rule, and of the batch.
-
-    ratio: RMS landmark error over the batch's.
-    """
+    """Figures of each rule, and of the batch. ratio: RMS landmark error over the batch's."""
     figures = {rule: over_seeds(of_rule) for rule, of_rule in runs.items() if of_rule}
     batches = {
         run["seed"]: run["batch"] for run in runs.get(pair_name(*OURS), []) if "batch" in run

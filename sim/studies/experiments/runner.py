@@ -86,10 +86,7 @@ FAILURES = "failures.txt"  # file with the tracebacks of the last command's fail
 
 @dataclass(frozen=True)
 class Concluded:
-    """Outcome, and failed runs with errors.
-
-    kinds: see `kinds_of`.
-    """
+    """Outcome, and failed runs with errors. kinds: see `kinds_of`."""
 
     entry: Entry
     options: Options

@@ -39,10 +39,7 @@ CODED_BEARING_SIGMA = math.sqrt(math.pi / 18.0**2)
 
 
 class Method(NamedTuple):
-    """Curve: name, pair, number of robots, colour.
-
-    particles: None: the scenario's.
-    """
+    """Curve: name, pair, number of robots, colour. particles: None: the scenario's."""
 
     name: str
     estimator: str

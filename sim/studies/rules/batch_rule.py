@@ -3,10 +3,10 @@
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
-from teamslam.central.config import CentralConfig
 from teamslam.sim.studies.batch_reference import growing as batch
 from teamslam.sim.studies.batch_reference.graph import load_gtsam
 from teamslam.sim.studies.batch_reference.growing import GrowingBatch, UnsolvableError
@@ -33,10 +33,8 @@ class BatchCentre(MeasurementCentre):
 
     _batch: GrowingBatch
 
-    def __init__(
-        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
-    ) -> None:
-        super().__init__(config, robots, admit=admit)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         load_gtsam()
         self._waiting: list[RobotStep] = []
         self._newest: dict[str, RobotKeyframe] = {}

@@ -5,11 +5,10 @@ meaning.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from teamslam.central.config import CentralConfig
 from teamslam.central.fused_map import fused_message
 from teamslam.central.node import CentralNode
 from teamslam.sim.studies.rules.map_fusion import (
@@ -87,10 +86,8 @@ class NewestMapsCentre(ComparisonCentre):
     inputs = (ch.START, ch.OWN_MAP)
     names_inputs = True
 
-    def __init__(
-        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
-    ) -> None:
-        super().__init__(config, robots, admit=admit)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self._maps: dict[str, m.MapEstimate] = {}
         self._starts: dict[Stream, m.InitialPose] = {}
 
@@ -151,10 +148,8 @@ class LatestCentre(NewestMapsCentre):
 
     names_inputs = False
 
-    def __init__(
-        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
-    ) -> None:
-        super().__init__(config, robots, admit=admit)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self._published: Mapping[Stream, int] = {}
         self._published_ns: int | None = None
 
@@ -256,10 +251,8 @@ class RoundsCentre(ComparisonCentre):
 
     inputs = (ch.START, ch.SUBMAP, ch.OWN_MAP)
 
-    def __init__(
-        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
-    ) -> None:
-        super().__init__(config, robots, admit=admit)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self._rounds: dict[int, dict[str, m.MapEstimate]] = {}
         self._next = 1
         self._fused: m.FusedMap | None = None

@@ -4,12 +4,11 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
-from teamslam.central.config import CentralConfig
 from teamslam.central.fused_map import START_POSES, fused_message
 from teamslam.sim.studies.estimators import joint_fastslam
 from teamslam.sim.studies.estimators.joint_fastslam import JointFastSlam
@@ -58,11 +57,9 @@ class MeasurementCentre(ComparisonCentre):
 
     inputs = (*ch.SENSORS, ch.ROBOT_CONFIG)
 
-    def __init__(
-        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
-    ) -> None:
-        super().__init__(config, robots, admit=admit)
-        self._keyframes = TeamKeyframes(robots)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._keyframes = TeamKeyframes(self.robots)
         self._map_ns: int | None = None
         self.models: dict[str, RobotConfig] = {}
         self.members: dict[str, m.VersionEntry] = {}
@@ -274,10 +271,8 @@ class JointFastSlamCentre(MeasurementCentre):
 
     _state: JointFastSlam
 
-    def __init__(
-        self, config: CentralConfig, robots: Sequence[str], *, admit: bool = False
-    ) -> None:
-        super().__init__(config, robots, admit=admit)
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
         self._generator = generator(0, "team", 0, 0)
 
     @property

@@ -42,10 +42,7 @@ NO_SIGHTINGS: Mapping[tuple[Stream, Stream], PointPairs] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class _Joined:
-    """Submaps of a stream so far.
-
-    refused: the submap that ended the chain, with the reason.
-    """
+    """Submaps of a stream so far. refused: the submap that ended the chain, with the reason."""
 
     count: int
     state: SubmapJoining

@@ -1,7 +1,7 @@
 """Merge all robots' raw measurements into one sequence of keyframes."""
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import NamedTuple
@@ -93,7 +93,7 @@ class TeamKeyframes:
     A stream ends where it restarts at an unknown pose; inter-robot measurements are not used.
     """
 
-    def __init__(self, robots: Sequence[str]) -> None:
+    def __init__(self, robots: Collection[str]) -> None:
         self._streams = {robot: _Stream(robot) for robot in sorted(robots)}
 
     def configure(self, robot: str, config: RobotConfig) -> None:

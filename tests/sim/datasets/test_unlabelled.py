@@ -167,7 +167,7 @@ def launched(*words):
 
 
 def test_launch_checks_a_log_of_one_robot_before_any_process_starts(steps, car):
-    assert "--dataset FOLDER" in launched("victoria")
+    assert "name it with --dataset" in launched("victoria")
     text = (car / "detections.csv").read_text()
     (car / "detections.csv").write_text(text.replace("10.0", "abc"))
     assert "line 2, column range_m: 'abc' is not a number" in launched("--dataset", car)
