@@ -35,7 +35,7 @@ class RuleRow(NamedTuple):
 
 COMPARISON_ROBOT = "teamslam.sim.studies.robots.node:comparison_robot"
 """Makes the robot's node of a pair whose rule does not fuse submaps."""
-_RUNNING = "teamslam.sim.studies.robots.running:running_estimator"
+_RUNNING = "teamslam.sim.studies.robots.running:RunningEstimator"
 _WHOLE = ("latest", "alone")
 _ROUNDS = "teamslam.sim.studies.rules.map_rules:RoundsCentre"
 _SVD = "teamslam.sim.studies.rules.svd_rule:SvdCentre"

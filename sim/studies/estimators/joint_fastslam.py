@@ -11,90 +11,62 @@ import numpy as np
 
 from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
 from teamslam.sim.studies.estimators.robot_step import RobotStep
-from teamslam.team import core
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
 from teamslam.team.estimation.se2 import Pose
-from teamslam.team.shapes import Float, UInt32
+from teamslam.team.shapes import Float
 
 
 @dataclass(frozen=True)
 class JointFastSlam:
     """M particles (x¹, …, xᴿ, m, w).
 
-    poses: (x [m], y [m], theta [rad]) by robot and particle. resample_below: relative effective
-    sample size; 1: always.
+    poses: (x [m], y [m], theta [rad]) by robot and particle. newest: maps, weights, and the poses
+    of the robot that moved last. resample_below: relative effective sample size; 1: always.
     """
 
     robots: tuple[str, ...]
     poses: Float[np.ndarray, "R M 3"]
-    log_weights: Float[np.ndarray, " M"]
-    ids: UInt32[np.ndarray, " L"]
-    means: Float[np.ndarray, "M L 2"]
-    covariances: Float[np.ndarray, "M L 3"]
+    newest: Particles
     proposal: Proposal
     resample_below: float
+
+    def of_robot(self, robot: str) -> Particles:
+        """Particles with the poses of one robot."""
+        return replace(self.newest, poses=self.poses[self.robots.index(robot)])
 
 
 def initial_state(
     poses: Mapping[str, Pose], particles: int, proposal: Proposal, resample_below: float
 ) -> JointFastSlam:
     """Start at exact poses."""
-    none = fastslam.at_poses(np.zeros((particles, 3)))
-    return JointFastSlam(
-        robots=tuple(poses),
-        poses=np.stack([np.tile(pose, (particles, 1)) for pose in poses.values()]),
-        log_weights=none.log_weights,
-        ids=none.ids,
-        means=none.means,
-        covariances=none.covariances,
-        proposal=proposal,
-        resample_below=resample_below,
-    )
+    of_robots = np.stack([np.tile(pose, (particles, 1)) for pose in poses.values()])
+    newest = fastslam.at_poses(of_robots[0])
+    return JointFastSlam(tuple(poses), of_robots, newest, proposal, resample_below)
 
 
 def filter_step(
     state: JointFastSlam, turns: Sequence[RobotStep], generator: np.random.Generator
 ) -> JointFastSlam:
     """Resample if the particles are thin, then process the robots' turns, each with p(zʳ | …)."""
-    thin = state.resample_below * len(state.log_weights)
-    if fastslam.effective_sample_size(state.log_weights) < thin:
-        parents = fastslam.systematic_parents(state.log_weights, generator.random())
-        state = replace(
-            state,
-            poses=state.poses[:, parents],
-            log_weights=np.full(len(parents), -core.log(float(len(parents)))),
-            means=state.means[parents],
-            covariances=state.covariances[parents],
-        )
+    log_weights = state.newest.log_weights
+    if fastslam.effective_sample_size(log_weights) < state.resample_below * len(log_weights):
+        newest, parents = fastslam.resampled(state.newest, generator)
+        state = replace(state, newest=newest, poses=state.poses[:, parents])
     for turn in turns:
-        index = state.robots.index(turn.robot)
-        after = turn.fastslam(_particles_of(state, index), state.proposal, generator)
+        newest = turn.fastslam(state.of_robot(turn.robot), state.proposal, generator)
         poses = state.poses.copy()
-        poses[index] = after.poses
-        state = replace(
-            state,
-            poses=poses,
-            log_weights=after.log_weights,
-            ids=after.ids,
-            means=after.means,
-            covariances=after.covariances,
-        )
+        poses[state.robots.index(turn.robot)] = newest.poses
+        state = replace(state, newest=newest, poses=poses)
     return state
 
 
 def pose_gaussian(state: JointFastSlam, robot: str) -> PoseGaussian:
     """Mean and covariance of one robot's poses."""
-    return pose_moments(_particles_of(state, state.robots.index(robot)))
+    return pose_moments(state.of_robot(robot))
 
 
 def landmark_gaussian(state: JointFastSlam) -> LandmarkGaussian:
     """Mixture of the particles' maps as one Gaussian."""
-    return landmark_moments(_particles_of(state, 0))
-
-
-def _particles_of(state: JointFastSlam, index: int) -> Particles:
-    return Particles(
-        state.poses[index], state.log_weights, state.ids, state.means, state.covariances
-    )
+    return landmark_moments(state.of_robot(state.robots[0]))

@@ -68,7 +68,7 @@ class RobotEstimator(Protocol):
     """Estimator on one incarnation.
 
     sequence: number of poses and maps. used: disposition of its measurements. joint: the map has a
-    joint covariance.
+    joint covariance. associates: accepts scans without identities, numbers from 2³¹ on.
     """
 
     @property
@@ -77,6 +77,8 @@ class RobotEstimator(Protocol):
     def used(self) -> str: ...  # noqa: D102
     @property
     def joint(self) -> bool: ...  # noqa: D102
+    @property
+    def associates(self) -> bool: ...  # noqa: D102
     @property
     def innovation(self) -> Innovation: ...  # noqa: D102
 
@@ -95,20 +97,8 @@ class RobotEstimator(Protocol):
     def own_map(self) -> LandmarkGaussian:
         """Running map from own measurements and absorbed maps."""
 
-
-@runtime_checkable
-class Associates(Protocol):
-    """Estimator that accepts scans without identities: numbers from 2³¹ on."""
-
-    associates: bool
-
-
-@runtime_checkable
-class AbsorbsMaps(Protocol):
-    """An estimator that absorbs the team's map (rules with feedback)."""
-
     def absorb(self, landmarks: LandmarkGaussian) -> None:
-        """Replace the own landmarks by the fused ones."""
+        """Replace the own landmarks by the fused ones, for rules with feedback."""
 
 
 Factory = Callable[[RobotConfig, int, InitialPose, KnownMap], RobotEstimator]

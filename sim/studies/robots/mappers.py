@@ -8,8 +8,6 @@ import numpy as np
 from teamslam.sim.studies.estimators.feedback import absorb_fused_map
 from teamslam.sim.studies.robots.filters import (
     NOTHING_KNOWN,
-    AbsorbsMaps,
-    Associates,
     Estimates,
     KnownMap,
     RobotEstimator,
@@ -145,8 +143,6 @@ class StreamMapper(ExchangingMapper):
 
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the landmarks by the fused ones."""
-        if not isinstance(self.estimator, AbsorbsMaps):
-            raise TypeError(f"the estimator {self.config.estimator} absorbs no map")
         self.estimator.absorb(landmarks)
 
     def drive(self, measurement: m.AnyOdometry) -> bool:
@@ -217,7 +213,7 @@ class StreamMapper(ExchangingMapper):
     @property
     def associates(self) -> bool:
         """Whether the estimator accepts detections without identities."""
-        return isinstance(self.estimator, Associates) and self.estimator.associates
+        return self.estimator.associates
 
     @property
     def sequence(self) -> int:

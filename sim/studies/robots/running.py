@@ -197,20 +197,8 @@ class RunningEstimator:
         """Landmarks so far."""
         return self._filter.landmarks(self._state)
 
-
-class AbsorbingEstimator(RunningEstimator):
-    """An estimator that absorbs fused landmarks."""
-
     def absorb(self, landmarks: LandmarkGaussian) -> None:
         """Replace the landmarks by the fused ones."""
-        assert self._filter.absorbed is not None
+        if self._filter.absorbed is None:
+            raise TypeError(f"the estimator {self._config.estimator} absorbs no map")
         self._state = self._filter.absorbed(self._state, *landmarks)
-
-
-def running_estimator(
-    config: RobotConfig, incarnation: int, initial: InitialPose, known: KnownMap
-) -> RunningEstimator:
-    """Make the configured estimator."""
-    absorbs = FILTERS[config.estimator].absorbed is not None
-    made = AbsorbingEstimator if absorbs else RunningEstimator
-    return made(config, incarnation, initial, known)

@@ -299,7 +299,7 @@ class JointFastSlamCentre(MeasurementCentre):
         for some in (turns, blind):  # if both fail the particles stay unchanged
             with suppress(NotACovarianceError, np.linalg.LinAlgError), np.errstate(all="ignore"):
                 after = joint_fastslam.filter_step(self._state, some, self._generator)
-                if np.isfinite(after.poses).all() and np.isfinite(after.log_weights).all():
+                if np.isfinite(after.poses).all() and np.isfinite(after.newest.log_weights).all():
                     self._state = after
                     break
             self.warnings.append("a step is refused: with it the particles have no weights")
