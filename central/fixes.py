@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.core import located
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream, named
 from teamslam.team.estimation.gaussian import information
@@ -20,7 +21,6 @@ from teamslam.team.estimation.inter_robot import STATION_POSE
 from teamslam.team.estimation.map_joining.gauss_newton import Island
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.submap_graph import Encounter
-from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import inverse, transformed
 from teamslam.team.shapes import Float
 

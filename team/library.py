@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike
 
 from teamslam.team import core, translate
 from teamslam.team.config import BIASES, BiasSigmas, FrontEnd, MotionModel, MotionNoise, Sensor
+from teamslam.team.core import located
+from teamslam.team.core import predicted as measurement_of
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.fastslam import (
@@ -29,8 +31,7 @@ from teamslam.team.estimation.hybrid_slam.fastslam import at_poses as particles_
 from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.marginals import LandmarkMap, Trajectory
-from teamslam.team.estimation.models import Increment, increment_of, located, scanned
-from teamslam.team.estimation.models import predicted as measurement_of
+from teamslam.team.estimation.models import Increment, increment_of, scanned
 from teamslam.team.estimation.se2 import compose, inverse
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.recording.reader import Log, LogError, open_log

@@ -15,10 +15,11 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import GNSS, Sensor
+from teamslam.team.core import NEAREST_M
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Stream, named
 from teamslam.team.estimation.gaussian import information
-from teamslam.team.estimation.models import NEAREST_M, Increment, noise
+from teamslam.team.estimation.models import Increment, noise
 from teamslam.team.estimation.se2 import Pose, inverse, rotation, transformed, wrapped
 from teamslam.team.shapes import Float
 

@@ -18,33 +18,8 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Bounds, MotionModel, MotionNoise, Sensor
-from teamslam.team.core import NEAREST_M, located, predicted
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Bool, Float
-
-__all__ = [
-    "LONGEST_NS",
-    "NEAREST_M",
-    "POINT",
-    "POLAR",
-    "SENSOR",
-    "Increment",
-    "Noise",
-    "Own",
-    "corrected",
-    "increment_of",
-    "located",
-    "nanoseconds",
-    "noise",
-    "noise_of",
-    "predicted",
-    "scanned",
-    "segmenter_of",
-    "steered",
-    "stream_bounds",
-    "unclaimed",
-    "variances",
-]
 
 LONGEST_NS = 2**62  # bound of the difference of two stamps
 _BOUNDS = Bounds()

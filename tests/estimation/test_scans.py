@@ -4,15 +4,8 @@ from msgspec.structs import replace
 
 from teamslam.team import core
 from teamslam.team.config import Bounds, Sensor
-from teamslam.team.core import Scan, landmarks_along_paths
-from teamslam.team.estimation.models import (
-    POINT,
-    POLAR,
-    noise_of,
-    predicted,
-    stream_bounds,
-    unclaimed,
-)
+from teamslam.team.core import Scan, landmarks_along_paths, predicted
+from teamslam.team.estimation.models import POINT, POLAR, noise_of, stream_bounds, unclaimed
 from teamslam.team.rejection import BY_CORE, Rejection
 from tests.estimation.hybrid_slam import one_landmark
 

@@ -17,7 +17,7 @@ import numpy as np
 from teamslam.sim.recorded.chains import Chain
 from teamslam.sim.studies.batch_reference.graph import Poses, path_graph, pose_key, under_loss
 from teamslam.team.config import BiasSigmas, Sensor
-from teamslam.team.estimation.models import NEAREST_M, predicted
+from teamslam.team.core import NEAREST_M, predicted
 from teamslam.team.estimation.se2 import Point, wrapped
 from teamslam.team.shapes import Float
 

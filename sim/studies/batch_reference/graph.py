@@ -8,8 +8,9 @@ import numpy as np
 from teamslam.central.desk.evaluation.results import MapResult
 from teamslam.sim.recorded.chains import Chain, Scan
 from teamslam.team.config import Sensor
+from teamslam.team.core import located, predicted
 from teamslam.team.estimation.gaussian import Matrix
-from teamslam.team.estimation.models import Increment, located, predicted
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import Point, Pose, tangent
 from teamslam.team.extras import install_command
 from teamslam.team.registry import NotInstalledError

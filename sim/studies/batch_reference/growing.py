@@ -24,8 +24,8 @@ from teamslam.sim.studies.batch_reference.graph import (
 )
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
+from teamslam.team.core import located
 from teamslam.team.estimation.gaussian import LandmarkGaussian, Matrix, PoseGaussian
-from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import Pose, compose, tangent
 from teamslam.team.library import BatchMap, InitialPose, Keyframe, LandmarkMap, Trajectory
 from teamslam.team.shapes import Float, UInt32

@@ -15,9 +15,9 @@ from teamslam.sim.studies.estimators.robot_step import (
     variances,
 )
 from teamslam.team import core
+from teamslam.team.core import NEAREST_M
 from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError, PoseGaussian
 from teamslam.team.estimation.hybrid_slam.window import Innovation
-from teamslam.team.estimation.models import NEAREST_M
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Bool, Float, Int64, UInt32

@@ -11,6 +11,7 @@ import numpy as np
 
 from teamslam.sim.studies.estimators.plain_fastslam import landmark_moments, pose_moments
 from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team import core
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles, Proposal
@@ -51,7 +52,7 @@ def filter_step(
 ) -> JointFastSlam:
     """Resample if the particles are thin, then process the robots' turns, each with p(zʳ | …)."""
     log_weights = state.newest.log_weights
-    if fastslam.effective_sample_size(log_weights) < state.resample_below * len(log_weights):
+    if core.effective_sample_size(log_weights) < state.resample_below * len(log_weights):
         newest, parents = fastslam.resampled(state.newest, generator)
         state = replace(state, newest=newest, poses=state.poses[:, parents])
     for turn in turns:

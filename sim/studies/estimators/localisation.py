@@ -65,7 +65,7 @@ def filter_step(
     """Resample a thin cloud, draw the motion, multiply the weights by Π p(z | pose, map)."""
     cloud = state.cloud
     thin = state.resample_below * len(cloud.poses)
-    if fastslam.effective_sample_size(cloud.log_weights) < thin:
+    if core.effective_sample_size(cloud.log_weights) < thin:
         cloud, _ = fastslam.resampled(cloud, generator)
     cloud = fastslam.propagated(cloud, step.increment, generator)
     mapped = np.isin(step.ids, state.ids)
@@ -76,7 +76,7 @@ def filter_step(
         np.column_stack((step.ranges[mapped], step.bearings[mapped])),
         variances(step.sensor),
     )
-    log_weights, _ = fastslam.normalise(log_weights)
+    log_weights, _ = core.normalise(log_weights)
     return replace(state, cloud=replace(cloud, log_weights=log_weights))
 
 

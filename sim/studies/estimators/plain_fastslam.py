@@ -43,7 +43,7 @@ def filter_step(
     """Resample if needed, move, and update."""
     particles = state.particles
     thin = state.resample_below * len(particles.poses)
-    if fastslam.effective_sample_size(particles.log_weights) < thin:
+    if core.effective_sample_size(particles.log_weights) < thin:
         particles, _ = fastslam.resampled(particles, generator)
     return replace(state, particles=step.fastslam(particles, state.proposal, generator))
 

@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.core import located
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.gaussian import LandmarkGaussian, PoseGaussian, information
@@ -18,7 +19,6 @@ from teamslam.team.estimation.map_joining import joining
 from teamslam.team.estimation.map_joining.alignment import procrustes
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings, joint_marginal
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
-from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import Pose, wrapped
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.shapes import Float, Int64

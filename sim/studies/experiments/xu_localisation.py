@@ -36,7 +36,7 @@ from teamslam.sim.studies.experiments.team_runs import Figures, with_world
 from teamslam.sim.studies.experiments.xu import ErrorFigure, Method, Panel, with_particles
 from teamslam.sim.studies.rules.team_keyframes import RobotKeyframe, TeamKeyframes
 from teamslam.sim.world.config import SimulatedWorld
-from teamslam.team import translate
+from teamslam.team import core, translate
 from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
@@ -291,7 +291,7 @@ def _summary(state: Localisation, true: np.ndarray) -> Figures:
         "sigma_m": float(np.sqrt(np.trace(covariance[:2, :2]))),
         "heading_error_deg": float(abs(np.degrees(wrapped(mean[2] - true[2])))),
         "nees_per_dof": nees(off, covariance[:2, :2]) / 2.0,
-        "effective": fastslam.effective_sample_size(state.cloud.log_weights),
+        "effective": core.effective_sample_size(state.cloud.log_weights),
         "different": len(np.unique(state.cloud.poses, axis=0)),
     }
 

@@ -12,24 +12,10 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
-from teamslam.team.core import effective_sample_size, normalise, systematic_parents
+from teamslam.team.core import effective_sample_size, systematic_parents
 from teamslam.team.estimation.gaussian import CoreErrors
 from teamslam.team.estimation.models import Increment, Own, noise_of, unclaimed
 from teamslam.team.shapes import Float, Int64, UInt32
-
-__all__ = [
-    "Particles",
-    "Proposal",
-    "StepInfo",
-    "at_poses",
-    "effective_sample_size",
-    "filter_step",
-    "normalise",
-    "propagated",
-    "propagated_and_updated",
-    "resampled",
-    "systematic_parents",
-]
 
 Proposal = Literal["fastslam2", "fastslam1"]
 Arrays = tuple[

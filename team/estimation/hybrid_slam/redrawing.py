@@ -11,17 +11,19 @@ approximation (Geweke 1989, Econometrica 57(6)).
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.config import Sensor
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.association.scans import Scans, points_of
 from teamslam.team.estimation.association.smoothing import JITTER, SmoothedWindow, smooth_window
-from teamslam.team.estimation.hybrid_slam.fastslam import effective_sample_size, normalise
+from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.window import Window
-from teamslam.team.estimation.models import POINT, noise_of, variances
-from teamslam.team.estimation.se2 import adjoint, between, inverse
+from teamslam.team.estimation.models import POINT, Own, noise_of, variances
+from teamslam.team.estimation.se2 import adjoint, between, inverse, wrapped
 from teamslam.team.shapes import Float, Int64
 
 Paths = Float[np.ndarray, "K M 3"]
@@ -31,6 +33,19 @@ uncertainty (as `pipeline.DEPLETED` of particles).
 """
 
 
+class _Measured(NamedTuple):
+    """The measurements that the window has used: as points, and as ranges and bearings.
+
+    slots: landmark of each. variances: (rr, rb, bb). own: claimed noises.
+    """
+
+    scans: Scans
+    slots: Int64[np.ndarray, " N"]
+    measurements: Float[np.ndarray, "N 2"]
+    variances: Float[np.ndarray, "N 3"]
+    own: Own
+
+
 def redraw_paths(window: Window, keyframes: Sequence[core.Keyframe], random: core.Random) -> None:
     """Redraw the window's paths if few lines of descent are left and the new paths are more.
 
@@ -38,26 +53,26 @@ def redraw_paths(window: Window, keyframes: Sequence[core.Keyframe], random: cor
     at the first keyframe. Draws 3 K M normal numbers, if any. keyframes: those whose measurements
     the window has used.
     """
-    weights = core.exp(window.particles.log_weights)
-    if not len(window.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
+    particles = window.particles
+    weights = core.exp(particles.log_weights)
+    if not len(particles.ids) or (left := _lines_of_descent(window, weights)) >= FEW:
         return
-    slots = _slots(window)
-    scans = _scans(window, keyframes)
-    landmarks = dense.product(weights, _rows(window.particles.means)).reshape(-1, 2)
-    poses = window.core.mean_path()
+    measured = _measured(window, particles, keyframes)
+    means = np.ascontiguousarray(particles.means).reshape(len(weights), -1)
+    landmarks = dense.product(weights, means).reshape(-1, 2)
     try:
-        now = smooth_window(scans, slots, poses, landmarks)
-        paths, log_weights = _drawn(now, scans, len(weights), random)
-        means, covariances = _landmarks(window, paths, (scans, slots))
+        now = smooth_window(measured.scans, measured.slots, window.core.mean_path(), landmarks)
+        paths, log_weights = _drawn(now, measured.scans, len(weights), random)
+        solved = _landmarks(window.sensor, particles, paths, measured)
     except (np.linalg.LinAlgError, core.NotFiniteError):
         return
-    log_weights += _likelihood(window, paths, means, covariances, (scans, slots))
+    log_weights += _likelihood(paths, *solved, measured)
     if not np.isfinite(log_weights).all():
         return
-    log_weights, _ = normalise(log_weights)
-    if effective_sample_size(log_weights) <= left:
+    log_weights, _ = core.normalise(log_weights)
+    if core.effective_sample_size(log_weights) <= left:
         return
-    window.core.replace(paths, log_weights, means, covariances)
+    window.core.replace(paths, log_weights, *solved)
 
 
 def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float:
@@ -66,28 +81,24 @@ def _lines_of_descent(window: Window, weights: Float[np.ndarray, " M"]) -> float
     return 1.0 / float(dense.product(shares, shares))
 
 
-def _slots(window: Window) -> Int64[np.ndarray, " N"]:
-    known = window.particles.ids
-    order = np.argsort(known)
-    found: Int64[np.ndarray, " N"] = order[np.searchsorted(known[order], window.ids)]
-    return found
-
-
-def _rows(values: Float[np.ndarray, "M L k"]) -> Float[np.ndarray, "M _"]:
-    return np.ascontiguousarray(values).reshape(len(values), -1)
-
-
-def _scans(window: Window, keyframes: Sequence[core.Keyframe]) -> Scans:
-    ranges, bearings = window.measurements.T
-    points, covariances = points_of(ranges, bearings, variances(ranges, window.own, window.sensor))
-    return Scans(
+def _measured(
+    window: Window, particles: Particles, keyframes: Sequence[core.Keyframe]
+) -> _Measured:
+    of, ids, measurements, own = window.core.measurements()
+    order = np.argsort(particles.ids)
+    ranges, bearings = measurements.T
+    noise = variances(ranges, own, window.sensor)
+    points, covariances = points_of(ranges, bearings, noise)
+    scans = Scans(
         motions=np.array([each.motion[0] for each in keyframes]),
         motion_covariances=np.array([each.motion[1] for each in keyframes]),
-        keyframes=window.keyframes,
+        keyframes=of,
         points=points,
         covariances=covariances,
-        names=window.ids.astype(np.int64),
+        names=ids.astype(np.int64),
     )
+    slots = order[np.searchsorted(particles.ids[order], ids)]
+    return _Measured(scans, slots, measurements, noise, own)
 
 
 def _drawn(
@@ -104,7 +115,7 @@ def _drawn(
     motions = np.broadcast_to(scans.motions[:, None], paths.shape)
     error = np.empty_like(paths)
     error[..., :2] = _seen(motions, went - motions[..., :2])
-    error[..., 2] = _wrapped(paths[..., 2] - before[..., 2] - motions[..., 2])
+    error[..., 2] = wrapped(paths[..., 2] - before[..., 2] - motions[..., 2])
     squared = _squared(error, scans.motion_covariances + JITTER)
     of_draw = _row_sums(core.squared(normals))
     return paths, 0.5 * (of_draw - squared)
@@ -141,9 +152,9 @@ def _placed(
 
 
 def _landmarks(
-    window: Window, paths: Paths, measured: tuple[Scans, Int64[np.ndarray, " N"]]
+    sensor: Sensor, particles: Particles, paths: Paths, measured: _Measured
 ) -> tuple[Float[np.ndarray, "M L 2"], Float[np.ndarray, "M L 3"]]:
-    (scans, slots), particles = measured, window.particles
+    scans, slots = measured.scans, measured.slots
     points = np.broadcast_to(scans.points[:, None], (len(slots), paths.shape[1], 2))
     starts = np.zeros((len(particles.ids), paths.shape[1], 2))
     np.add.at(starts, slots, _placed(paths[scans.keyframes], points))
@@ -153,37 +164,32 @@ def _landmarks(
         starts.transpose(1, 0, 2),
         particles.covariances,
         paths,
-        window.keyframes,
-        window.ids,
-        window.measurements,
-        window.own,
-        noise_of(window.sensor)._replace(range_white=1.0, bearing_white=1.0),
+        scans.keyframes,
+        particles.ids[slots],
+        measured.measurements,
+        measured.own,
+        noise_of(sensor)._replace(range_white=1.0, bearing_white=1.0),
     )
 
 
 def _likelihood(
-    window: Window,
     paths: Paths,
     means: Float[np.ndarray, "M L 2"],
     covariances: Float[np.ndarray, "M L 3"],
-    measured: tuple[Scans, Int64[np.ndarray, " N"]],
+    measured: _Measured,
 ) -> Float[np.ndarray, " M"]:
     """Compute log p(measurements | path) + constant, landmarks integrated out by Laplace's method.
 
     The noise of a POINT is Gaussian in the plane, that of others in range and bearing.
     """
-    scans, slots = measured
+    scans, own = measured.scans, measured.own
     at = paths[scans.keyframes]
-    seen = _seen(at, means.transpose(1, 0, 2)[slots] - at[..., :2])
-    own = window.own
-    ranges = window.measurements[:, 0]
-    rr, rb, bb = variances(ranges, own, window.sensor).T
-    noise = np.stack((np.stack((rr, rb), -1), np.stack((rb, bb), -1)), -2)
+    seen = _seen(at, means.transpose(1, 0, 2)[measured.slots] - at[..., :2])
+    noise = measured.variances[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    ranges, bearings = measured.measurements.T[..., None]
     error = np.empty_like(seen)
-    error[..., 0] = core.hypot(seen[..., 0], seen[..., 1]) - window.measurements[:, None, 0]
-    error[..., 1] = _wrapped(
-        core.atan2(seen[..., 1], seen[..., 0]) - window.measurements[:, None, 1]
-    )
+    error[..., 0] = core.hypot(seen[..., 0], seen[..., 1]) - ranges
+    error[..., 1] = wrapped(core.atan2(seen[..., 1], seen[..., 0]) - bearings)
     if own.size:
         plane = own[:, 3] == POINT
         error[plane] = (seen - scans.points[:, None])[plane]
@@ -200,10 +206,6 @@ def _seen(
     s, c = core.sin_and_cos(poses[..., 2])
     x, y = apart[..., 0], apart[..., 1]
     return np.stack((c * x + s * y, c * y - s * x), axis=-1)
-
-
-def _wrapped(angles: Float[np.ndarray, "K M"]) -> Float[np.ndarray, "K M"]:
-    return angles + 2.0 * np.pi * np.floor((np.pi - angles) / (2.0 * np.pi))
 
 
 def _squared(

@@ -51,10 +51,9 @@ NOTHING = Innovation(0.0, 0)
 
 
 class Window(msgspec.Struct, gc=False):
-    """Particles since the window's start, their paths, and the measurements used.
+    """Particles since the window's start, and their paths, as copies of the core's state.
 
-    The properties are copies of the core's state: K keyframes, N measurements, M particles. Poses
-    are the sensor's, in the frame of its start.
+    K keyframes, M particles. Poses are the sensor's, in the frame of its start.
     """
 
     front_end: FrontEnd
@@ -88,31 +87,6 @@ class Window(msgspec.Struct, gc=False):
     def paths(self) -> Float[np.ndarray, "K M 3"]:
         """Pose of each particle's line of descent at each keyframe."""
         return self.core.paths()
-
-    @property
-    def keyframes(self) -> Int64[np.ndarray, " N"]:
-        """Keyframe of each measurement, in [0, K)."""
-        return self.core.measurements()[0]
-
-    @property
-    def ids(self) -> UInt32[np.ndarray, " N"]:
-        """Landmark of each measurement."""
-        return self.core.measurements()[1]
-
-    @property
-    def measurements(self) -> Float[np.ndarray, "N 2"]:
-        """Calibrated (range [m], bearing [rad])."""
-        return self.core.measurements()[2]
-
-    @property
-    def own(self) -> Own:
-        """Noises that the measurements claim (`teamslam.team.estimation.models`)."""
-        return self.core.measurements()[3]
-
-    @property
-    def landmarks(self) -> UInt32[np.ndarray, " L"]:
-        """Landmarks in order of first observation."""
-        return self.core.ids()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.team import core
+from teamslam.team.core import located
 from teamslam.team.estimation import dense
 from teamslam.team.estimation.consistency import chi2_limit
 from teamslam.team.estimation.gaussian import UNSOLVABLE, deviation
@@ -54,7 +55,6 @@ from teamslam.team.estimation.map_joining.submap_graph import (
     observer_of,
     teammate_of,
 )
-from teamslam.team.estimation.models import located
 from teamslam.team.estimation.se2 import transformed
 from teamslam.team.shapes import Float
 

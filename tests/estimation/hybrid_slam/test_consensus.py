@@ -11,8 +11,8 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.core import Scan
-from teamslam.team.estimation.models import Increment, increment_of, noise_of, predicted, unclaimed
+from teamslam.team.core import Scan, predicted
+from teamslam.team.estimation.models import Increment, increment_of, noise_of, unclaimed
 from teamslam.team.estimation.se2 import compose
 from tests.scenarios import with_world
 

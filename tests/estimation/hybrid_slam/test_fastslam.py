@@ -129,7 +129,7 @@ def test_a_nearly_linear_problem_gets_the_posterior_of_the_kalman_filter(proposa
     sigma = np.sqrt(np.diag(P))
     error = found - mean
     error[2] = wrap(error[2])
-    effective = fastslam.effective_sample_size(particles.log_weights)
+    effective = core.effective_sample_size(particles.log_weights)
     assert effective > 0.05 * count
     assert np.abs(error / sigma).max() < 5.0 / np.sqrt(0.2 * effective)
     assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 0.12
@@ -167,7 +167,7 @@ def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
 
 
 weights = st.lists(st.floats(-30.0, 0.0), min_size=1, max_size=12).map(
-    lambda values: fastslam.normalise(np.array(values))[0]
+    lambda values: core.normalise(np.array(values))[0]
 )
 
 
@@ -177,7 +177,7 @@ def test_resampling_is_unbiased_and_never_off_by_one_copy(log_weights):
     expected = len(log_weights) * np.exp(log_weights)
     counts = np.array(
         [
-            np.bincount(fastslam.systematic_parents(log_weights, u), minlength=len(log_weights))
+            np.bincount(core.systematic_parents(log_weights, u), minlength=len(log_weights))
             for u in (np.arange(500) + 0.5) / 500
         ]
     )

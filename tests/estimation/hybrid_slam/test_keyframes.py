@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from teamslam.team import core
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.core import OdometryInterval, Scan
+from teamslam.team.core import OdometryInterval, Scan, located
 from teamslam.team.estimation import se2
-from teamslam.team.estimation.models import Increment, increment_of, located, segmenter_of
+from teamslam.team.estimation.models import Increment, increment_of, segmenter_of
 from teamslam.team.rejection import BY_CORE, Rejection
 from tests.core.test_odometry import shift_of
 

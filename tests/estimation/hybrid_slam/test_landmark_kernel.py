@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from teamslam.team import core
-from teamslam.team.estimation.models import predicted
+from teamslam.team.core import predicted
 from teamslam.team.estimation.se2 import compose, exponential, inverse, tangent, wrapped
 from tests.estimation.hybrid_slam import one_landmark
 

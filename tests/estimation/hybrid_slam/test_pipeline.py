@@ -14,10 +14,10 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.core import Keyframe, OdometryInterval, Scan
+from teamslam.team.core import Keyframe, OdometryInterval, Scan, predicted
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam, OpenWindow
-from teamslam.team.estimation.models import increment_of, predicted
+from teamslam.team.estimation.models import increment_of
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.wire import messages as m

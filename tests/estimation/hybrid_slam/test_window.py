@@ -71,7 +71,7 @@ def move(window, motion, seed):
 
 
 def bytes_of(window):
-    values = [window.paths, window.keyframes, window.ids, window.measurements]
+    values = [window.paths, *window.core.measurements()[:3]]
     values += [getattr(window.particles, f.name) for f in dataclasses.fields(window.particles)]
     return [value.tobytes() for value in values]
 

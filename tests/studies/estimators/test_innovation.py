@@ -3,8 +3,9 @@ import pytest
 
 from teamslam.sim.studies.estimators.robot_step import RobotStep, innovation
 from teamslam.team.config import Sensor
+from teamslam.team.core import predicted
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
-from teamslam.team.estimation.models import Increment, predicted
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.hybrid_slam.test_window import wrap
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from teamslam.sim.studies.estimators import joint_fastslam, plain_fastslam
-from teamslam.team.estimation.hybrid_slam import fastslam
+from teamslam.team import core
 from tests.estimation.team_rounds import STARTS, team_run
 
 PROPOSALS = ["fastslam1", "fastslam2"]
@@ -62,6 +62,6 @@ def test_robots_that_share_no_landmark_multiply_their_weights(proposal):
             alone[turn.robot] = plain_fastslam.filter_step(alone[turn.robot], turn, random)
     product = sum(state.particles.log_weights for state in alone.values())
     newest = joint.newest.log_weights
-    np.testing.assert_allclose(newest, fastslam.normalise(product)[0], atol=1e-9)
+    np.testing.assert_allclose(newest, core.normalise(product)[0], atol=1e-9)
     for index, state in enumerate(alone.values()):
         np.testing.assert_array_equal(joint.poses[index], state.particles.poses)

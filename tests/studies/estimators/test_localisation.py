@@ -6,9 +6,9 @@ import pytest
 
 from teamslam.sim.studies.estimators import localisation
 from teamslam.sim.studies.estimators.robot_step import RobotStep
+from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
-from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.hybrid_slam.window import NOTHING
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
@@ -68,7 +68,7 @@ def test_from_an_unknown_start_it_has_the_posterior_of_a_grid():
     state = localisation.filter_step(state, second, random)
     found, spread = localisation.pose_gaussian(state)
     sigma = np.sqrt(np.diag(P))
-    effective = fastslam.effective_sample_size(state.cloud.log_weights)
+    effective = core.effective_sample_size(state.cloud.log_weights)
     assert effective > 300.0
     assert np.abs((found - mean) / sigma).max() < 4.0 / np.sqrt(effective)
     assert np.abs((spread - P) / np.outer(sigma, sigma)).max() < 6.0 / np.sqrt(effective)
