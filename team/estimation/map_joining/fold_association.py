@@ -47,7 +47,6 @@ from teamslam.team.estimation.map_joining.joining import (
     separate_moved,
 )
 from teamslam.team.estimation.map_joining.merging import Merge, place_island
-from teamslam.team.estimation.map_joining.minima import solve_minimum
 from teamslam.team.estimation.map_joining.saved_maps import (
     FALSE_ALARM,
     LEAST_SUBMAPS,
@@ -226,10 +225,8 @@ def _close_loop(fold: Fold, stream: Stream, last: int, views: _IslandViews) -> F
     view.record_merges(MergedPairs(found.pairs, view.joint), "closure")
     fold = _apply_merges(fold, key, view)
     fold = replace(fold, landmarks=fold.landmarks.add_decisions(decision))
-    island, iterations, change = solve_island(fold.islands[key])
-    islands = {**fold.islands, key: island}
-    fold = replace(fold, islands=islands, iterations=iterations, change=change)
-    return _merge_near(fold, key)
+    island, *_ = solve_island(fold.islands[key])
+    return _merge_near(replace(fold, islands={**fold.islands, key: island}), key)
 
 
 def _join_island(
@@ -343,10 +340,10 @@ def _merge_islands(
     place = second_from_first if stays == keys[1] else inverse(second_from_first)
     both, waiting = place_island(renamed[stays], renamed[goes], place, fold.waiting)
     try:
-        best = solve_minimum(both)
+        both, *_ = solve_island(both)
     except UNSOLVABLE:
         return fold
-    if not is_solvable(best.island):
+    if not is_solvable(both):
         return fold
     words = (
         f"{decision.pairs} landmarks that both show, log-likelihood ratio "
@@ -355,7 +352,7 @@ def _merge_islands(
     )
     fold = replace(fold, landmarks=landmarks.add_decisions(decision))
     streams = sorted(renamed[goes].graph.streams)
-    fold = merge_islands(fold, stays, goes, Merge(best, waiting, words))
+    fold = merge_islands(fold, stays, goes, Merge(both, waiting, words))
     fold = _merge_near(fold, stays)
     views = _IslandViews()
     step = patch_step(fold.islands[stays].settings.association)

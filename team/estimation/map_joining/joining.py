@@ -108,11 +108,10 @@ class Fold:
     merge, by the former frame. warnings: signs of another minimum; rival_m: its distance [m], if
     about as likely. waiting: inter-robot measurements between two islands. judged: number of
     submaps of two islands at their last failed merge, and its reason; ambiguous: where several
-    alignments passed; searched_at: at an island's last failed search for a lower minimum.
-    iterations, change: of the main island's last full solution [m, rad]. refused: submaps not in
-    the map, with the reason (`tick`); motion_only: those with their motion in the map; left_out:
-    inter-robot measurements without a solution; set_aside: other refusals. audits: closures that
-    may be undone (`tick`). cuts: seams that cut a stream (`continuity`).
+    alignments passed; searched_at: at an island's last failed search for a lower minimum. refused:
+    submaps not in the map, with the reason (`tick`); motion_only: those with their motion in the
+    map; left_out: inter-robot measurements without a solution; set_aside: other refusals. audits:
+    closures that may be undone (`tick`). cuts: seams that cut a stream (`continuity`).
     """
 
     contributions: tuple[Contribution, ...]
@@ -121,8 +120,6 @@ class Fold:
     home: Mapping[Stream, Stream]
     reasons: Mapping[Stream, str]
     waiting: tuple[InterRobotFactor, ...] = ()
-    iterations: int = 0
-    change: float = 0.0
     joined: Mapping[Stream, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     rival_m: float | None = None
@@ -286,13 +283,8 @@ def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold
         for key, island in fold.islands.items()
     }
     main = searches[main_key]
-    solved = replace(
-        fold,
-        islands={key: each.best.island for key, each in searches.items()},
-        iterations=main.best.iterations,
-        change=main.best.change,
-    )
-    merged = _merge_all(solved, at_last=True)
+    islands = {key: each.best.island for key, each in searches.items()}
+    merged = _merge_all(replace(fold, islands=islands), at_last=True)
     if merged.has_maps:
         merged = _test_saved_places(merged)
     last = main if merged.main is main.best.island else _search_island(merged.main)
@@ -304,8 +296,6 @@ def _solve_islands(fold: Fold, settings: JoinSettings, main_key: Stream) -> Fold
     return replace(
         merged,
         islands={**merged.islands, merged.main_key or main_key: last.best.island},
-        iterations=last.best.iterations,
-        change=last.best.change,
         warnings=(*warnings(last), *warn_of_unmarked(last.best.island)),
         rival_m=rival_distance(last),
     )
@@ -413,7 +403,7 @@ def _frame_of(streams: Collection[Stream]) -> Stream:
 def merge_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> Fold:
     """Merge two islands; record the merge under the vanished frame."""
     islands = {at: each for at, each in fold.islands.items() if at != other_key}
-    islands[key] = found.best.island
+    islands[key] = found.island
     streams = sorted(fold.islands[other_key].graph.streams)
     gone, into = streams[0], min(fold.islands[key].graph.streams)
     who = ", ".join(map(named, streams[:NAMED])) + ", …" * (len(streams) > NAMED)
@@ -426,8 +416,6 @@ def merge_islands(fold: Fold, key: Stream, other_key: Stream, found: Merge) -> F
         waiting=found.waiting,
         joined={**fold.joined, gone: f"{who} joined {named(into)} at {at}: {found.words}"},
         judged={pair: record for pair, record in fold.judged.items() if not gone_keys & {*pair}},
-        iterations=found.best.iterations,
-        change=found.best.change,
     )
 
 

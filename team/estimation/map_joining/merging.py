@@ -178,7 +178,7 @@ WORTH_TELLING = 1.0  # least reported gain of a search in χ²
 class Merge(NamedTuple):
     """The merged island, the waiting inter-robot measurements, and a description."""
 
-    best: Minimum
+    island: Island
     waiting: tuple[InterRobotFactor, ...]
     words: str
 
@@ -240,7 +240,7 @@ def _merge(main: Island, other: Island, waiting: Sequence[InterRobotFactor]) -> 
     island, left = add_sightings(
         search.best.island, sorted((*left, *aside), key=lambda each: each.key)
     )
-    return Merge(search.best._replace(island=island), left, words)
+    return Merge(island, left, words)
 
 
 def _separate_moved(main: Island, other: Island) -> tuple[Island, Island] | Waits:

@@ -103,7 +103,6 @@ def test_the_incremental_solution_converges_to_the_one_from_scratch(seed):
     world = team(seed, robots=3, submaps=10)
     one_by_one = solve_fold(joined(world.submaps, world.starts, tick=1), EXACTLY)
     at_once = solve_fold(joined(world.submaps, world.starts, tick=1000), EXACTLY)
-    assert one_by_one.change < 1e-11
     np.testing.assert_allclose(
         landmark_map(one_by_one).means, landmark_map(at_once).means, atol=1e-8
     )
