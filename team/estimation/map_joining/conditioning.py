@@ -148,20 +148,19 @@ def join_pending(whole: WholeMap, pending: Iterable[LocalMap]) -> Followed:
     if not submaps:
         return Followed(whole)
     found = _solve_chain(whole, submaps)
-    known, refused = tuple(found.known.tolist()), tuple(0 for _ in submaps)
+    known, refused = tuple(found.known.tolist()), (0,) * len(submaps)
+    in_doubt = False
     if (found.landmark_chi2 > GATE).any():
         from teamslam.team.estimation.map_joining.contradictions import find_beyond
 
         beyond = find_beyond(whole, submaps, GATE)
         refused = tuple(int(each.sum()) for each in beyond)
-        if not any(is_majority(*pair) for pair in zip(refused, known, strict=True)):
-            found = _solve_chain(
-                whole, [remove_landmarks(*pair) for pair in zip(submaps, beyond, strict=True)]
-            )
+        in_doubt = any(map(is_majority, refused, known))
+        if not in_doubt:
+            found = _solve_chain(whole, [*map(remove_landmarks, submaps, beyond)])
     joint = found.map
-    disputed = found.cost > _largest_cost(found.dof) or any(
-        is_majority(*pair) for pair in zip(refused, known, strict=True)
-    )
+    largest = chi2_limit(found.dof, CONTRADICTED) if found.dof > 0 else math.inf
+    disputed = in_doubt or found.cost > largest
     if disputed:
         from teamslam.team.estimation.map_joining.contradictions import join_robustly
 
@@ -185,10 +184,6 @@ def _solve_chain(whole: WholeMap, submaps: Sequence[LocalMap]) -> core.ChainSolu
 def is_majority(refused: int, known: int) -> bool:
     """Return whether too many landmarks are refused for a fault in single ones."""
     return refused >= FEWEST and 2 * refused > known
-
-
-def _largest_cost(dof: int) -> float:
-    return chi2_limit(dof, CONTRADICTED) if dof > 0 else math.inf
 
 
 def remove_landmarks(local: LocalMap, beyond: Bool[np.ndarray, " L"]) -> LocalMap:
