@@ -17,7 +17,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import ids
 from teamslam.team.wire.bus import Bus, Sample, opened
 from teamslam.team.wire.codec import WireError, encoded
-from teamslam.team.wire.request_times import RequestTimes
+from teamslam.team.wire.intervals import RequestTimes
 
 _STORED = tuple(each for each in CHANNELS if each not in (ch.CONCLUDED, ch.CERTIFICATE))
 

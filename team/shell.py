@@ -21,7 +21,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample, read_reply
 from teamslam.team.wire.codec import WireError, decoded
-from teamslam.team.wire.request_times import RequestTimes
+from teamslam.team.wire.intervals import RequestTimes
 
 FAILED_S = 10.0
 """Time [s] before work that raised an exception is tried again."""

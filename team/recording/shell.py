@@ -16,8 +16,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, open_valid
 from teamslam.team.wire.codec import WireError, decoded, encoded
-from teamslam.team.wire.intervals import describe_intervals
-from teamslam.team.wire.request_times import RequestTimes
+from teamslam.team.wire.intervals import RequestTimes, describe_intervals
 
 
 def schedule(samples: Iterable[Sample], speed: float) -> Iterator[tuple[float, Sample]]:

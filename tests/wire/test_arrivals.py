@@ -3,9 +3,9 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teamslam.team.wire.intervals import IntervalSet
+from teamslam.team.wire.intervals import PATIENCE_S, IntervalSet
 from teamslam.team.wire.zenoh import recovery as module
-from teamslam.team.wire.zenoh.recovery import DELAY_S, PATIENCE_S, Arrivals
+from teamslam.team.wire.zenoh.recovery import DELAY_S, Arrivals
 
 
 @given(st.permutations(range(8)), st.lists(st.integers(0, 7), max_size=8))

@@ -1,6 +1,6 @@
 import itertools
 
-from teamslam.team.wire.request_times import LONGEST_S, PATIENCE_S, RequestTimes
+from teamslam.team.wire.intervals import LONGEST_S, PATIENCE_S, RequestTimes
 
 
 def asked(gap_of, seconds=40.0):

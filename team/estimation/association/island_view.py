@@ -151,9 +151,8 @@ class IslandView:
             places = submap.landmarks[known]
             one, two = np.nonzero(submap.observation.distinct[known][:, known])
             apart[places[one], places[two]] = True
-        for first, second, same in self._landmarks.verdicts:
-            here, there = self.find_place(first), self.find_place(second)
-            if not same and here is not None and there is not None:
+        for here, there, same in self.list_judged(self):
+            if not same:
                 apart[here, there] = apart[there, here] = True
         np.fill_diagonal(apart, False)
         one, two = forgotten.T
@@ -198,28 +197,29 @@ class IslandView:
     def _resolve(self, places: Indices) -> Indices:
         return np.unique(self._merged_into[places])
 
+    def list_judged(self, other: "IslandView") -> list[tuple[int, int, bool]]:
+        """List the verdicts on a landmark of this view and one of another, by index."""
+        return [
+            (here, there, each.same)
+            for each in self._landmarks.verdicts
+            if (here := self.find_place(each.first)) is not None
+            and (there := other.find_place(each.second)) is not None
+        ]
+
     def find_declared(self, other: "IslandView") -> set[tuple[int, int]]:
         """Find the landmarks of two islands, by index, that an operator declared to be one and not
         two.
         """
-        found: dict[bool, set[tuple[int, int]]] = {True: set(), False: set()}
-        for one, two, same in self._landmarks.verdicts:
-            for first, second in ((one, two), (two, one)):
-                here, there = self.find_place(first), other.find_place(second)
-                if here is not None and there is not None:
-                    found[same].add((here, there))
-        return found[True] - found[False]
+        judged = self.list_judged(other)
+        judged += [(there, here, same) for here, there, same in other.list_judged(self)]
+        two = {(here, there) for here, there, same in judged if not same}
+        return {(here, there) for here, there, same in judged if same} - two
 
     def apply_verdicts(self) -> None:
         """Merge the landmarks that an operator declared to be one, unless another verdict forbids
         it.
         """
-        declared = [
-            (here, there, each.same)
-            for each in self._landmarks.verdicts
-            if (here := self.find_place(each.first)) is not None
-            and (there := self.find_place(each.second)) is not None
-        ]
+        declared = self.list_judged(self)
         into = self._merged_into
         for first, second, same in declared:
             one, two = int(into[first]), int(into[second])

@@ -141,15 +141,14 @@ def _linearise_motions(
     BW = dense.product(back.transpose(0, 2, 1), weights)
     BWB = dense.product(BW, back)
     W_error, BW_error = np.einsum("kij,kj->ki", weights, error), np.einsum("kij,kj->ki", BW, error)
-    for i in range(k):
-        a, b = slice(3 * i - 3, 3 * i), slice(3 * i, 3 * i + 3)
-        information[b, b] += weights[i]
-        gradient[b] -= W_error[i]
-        if i:
-            information[a, a] += BWB[i]
-            information[a, b] += BW[i]
-            information[b, a] += BW[i].T
-            gradient[a] -= BW_error[i]
+    blocks, of_pose = information[: 3 * k, : 3 * k].reshape(k, 3, k, 3), gradient[: 3 * k]
+    at = np.arange(k)
+    blocks[at, :, at] += weights
+    blocks[at[:-1], :, at[:-1]] += BWB[1:]
+    blocks[at[:-1], :, at[1:]] += BW[1:]
+    blocks[at[1:], :, at[:-1]] += BW[1:].transpose(0, 2, 1)
+    of_pose -= W_error.ravel()
+    of_pose[:-3] -= BW_error[1:].ravel()
     return information, gradient, float(np.einsum("ki,ki->", error, W_error))
 
 

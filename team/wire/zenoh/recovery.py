@@ -18,7 +18,7 @@ from zenoh.handlers import Callback
 
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.channels import row_of
-from teamslam.team.wire.intervals import IntervalSet
+from teamslam.team.wire.intervals import LONGEST_S, PATIENCE_S, IntervalSet
 from teamslam.team.wire.logs import LOG
 
 ADVANCED = "/@adv/pub/"  # part of the keys of advanced publishers' heartbeats
@@ -33,8 +33,6 @@ LONGEST_KEY = 512  # longest key [characters] on which missing samples are reque
 MOST_ASKED = 256  # most cache requests in one check
 
 _UNTRACKED = "%.80s: too many publishers there, what is missing is not requested (%d so far)"
-PATIENCE_S = 0.5  # age [s] at which a gap is requested
-LONGEST_S = 8.0  # longest interval [s] between two requests, which double
 DELAY_S = 2.0  # longest delay [s] of publications after a gap
 MOST_GAPS = 4096  # most gaps per publisher and key; then the oldest is given up
 T = TypeVar("T")
