@@ -62,8 +62,6 @@ def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, 
     assert {each.number for each in found.contradicted} == contradicted
     assert all((number in there) == (number in table) for number in range(-1, 14))
     end = max(begin, end)
-    of_odometry = (isinstance(table.get(n), m.AnyOdometry) for n in range(begin, end))
-    assert there.intervals(begin, end) == sum(of_odometry)
     if table:
         stamps = [each.stamp_ns for each in table.values()]
         assert there.span_ns == (min(stamps), max(stamps))
