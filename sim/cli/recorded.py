@@ -190,15 +190,10 @@ def repair(
 
     opt.refuse_existing(output)
     log = log_file(log)
-    if log.suffix == ".mcap" and log.is_file() and not is_own_log(log):
-        bag = repair_bag(log, output)
-        click.echo(f"{output}: {opt.count_noun(bag.messages, 'message')}")
-        for damage in bag.damaged:
-            click.echo(f"lost: {damage}", err=True)
-        return
-    result = repair_log(log, output)
+    is_bag = log.suffix == ".mcap" and log.is_file() and not is_own_log(log)
+    result = repair_bag(log, output) if is_bag else repair_log(log, output)
     until = "" if result.until_ns is None else f" up to team time {result.until_ns * 1e-9:.3f} s"
-    click.echo(f"{output}: {result.messages} messages{until}")
+    click.echo(f"{output}: {opt.count_noun(result.messages, 'message')}{until}")
     for damage in result.damaged:
         click.echo(f"lost: {damage}", err=True)
 

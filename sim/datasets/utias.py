@@ -35,7 +35,6 @@ from teamslam.team.shapes import Bool, Float, Int64, UInt32
 class _Erratum:
     """Measurements of subject k are of subjects[k]."""
 
-    name: str
     subjects: Mapping[int, int]
     note: str
 
@@ -48,7 +47,6 @@ def content_digest(barcodes: Float[np.ndarray, "B 2"], landmarks: Float[np.ndarr
 
 ERRATA: Mapping[str, _Erratum] = {
     "60e044e708a8e77ea50d4ce724a4f85fa8ccd99276ed30acee64e58df8c0d5e4": _Erratum(
-        name="UTIAS set 1, landmarks 11 and 17",
         subjects={11: 17, 17: 11},
         note=(
             "erratum of UTIAS set 1 applied: the survey and the barcodes have landmarks 11 and 17 "

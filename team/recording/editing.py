@@ -61,14 +61,7 @@ def repair_log(path: str | Path, out: str | Path) -> Report:
 _FAULTS = (McapError, ValueError, struct.error, RuntimeError, MemoryError, OverflowError)
 
 
-class BagReport(NamedTuple):
-    """Number of messages copied, and the damage as text."""
-
-    messages: int
-    damaged: tuple[str, ...]
-
-
-def repair_bag(path: Path, out: Path) -> BagReport:
+def repair_bag(path: Path, out: Path) -> Report:
     """Copy the messages of an MCAP file's whole chunks to a new file with an index.
 
     Raises LogError, without a new file, if it has no whole message.
@@ -111,7 +104,7 @@ def repair_bag(path: Path, out: Path) -> BagReport:
             out.unlink(missing_ok=True)
     if not messages:
         raise LogError(path, "no MCAP file, or no whole message in it", "nothing can be repaired")
-    return BagReport(messages, tuple(damaged))
+    return Report(messages, None, tuple(damaged))
 
 
 def _records(reader: StreamReader, damaged: list[str]) -> Iterator[McapRecord]:
