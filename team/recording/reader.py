@@ -331,6 +331,7 @@ def _stamp_in(payload: bytes) -> int:
 
 
 MOST = 20_000  # approximate limit on samples per call
+_HEAD = 65_536  # file size [bytes] from which an invalid file cannot become a log
 
 
 @dataclass
@@ -380,6 +381,3 @@ class Tail:
                 raise
             return False
         return True
-
-
-_HEAD = 65_536  # file size [bytes] from which an invalid file cannot become a log
