@@ -236,7 +236,7 @@ def flip(path: Path, offset: int) -> None:
 
 
 def test_a_flipped_bit_is_found_in_a_chunk_and_in_the_index(whole):
-    ((offset, length),) = chunks_of(whole.path)
+    (offset, length), *_ = chunks_of(whole.path)
     flip(whole.path, offset + length - 5)
     assert found(whole)[0].startswith(f"file: damaged chunk at offset {offset}")
     flip(whole.path, offset + length - 5)
@@ -347,7 +347,7 @@ def test_damage_is_told_before_a_new_log_is_made_and_logs_of_two_teams_are_not_m
         recorder.write(drive("alpha", 1))
     with pytest.raises(LogError, match=r"u\.mcap: a log of team 'u', not 't' as .*log\.mcap is"):
         merge([whole, open_log(tmp_path / "u.mcap")], tmp_path / "a.mcap")
-    ((offset, length),) = chunks_of(whole.path)
+    (offset, length), *_ = chunks_of(whole.path)
     flip(whole.path, offset + length - 5)
     with pytest.raises(LogError, match=r"damaged chunk .* log repair` saves the rest"):
         cut(whole, tmp_path / "a.mcap", 1.0)
