@@ -25,6 +25,7 @@ from teamslam.team.estimation.gaussian import UNSOLVABLE, NotACovarianceError, i
 from teamslam.team.estimation.map_joining import hypotheses, marginals
 from teamslam.team.estimation.map_joining.continuity import Seam
 from teamslam.team.estimation.map_joining.joining import Fold
+from teamslam.team.estimation.map_joining.reflections import Reflection, find_reflections
 from teamslam.team.estimation.se2 import Pose, compose, wrapped
 from teamslam.team.shapes import Float
 from teamslam.team.wire import messages as m
@@ -134,9 +135,12 @@ def diagnose(
     if not fold.contributions or not fold.main.graph.submaps:
         return ()
     shared = list(_shared_errors(fold, biases, scale))
-    reflected = () if localise else _mirrored(fold, withdrawn)
-    found = [*shared, *reflected, *cuts_of(fold, spoilt)]
-    mirrored = {each.robot for each in found if each.cause == "mirrored"}
+    reflected = [] if localise else list(_mirrored(fold, withdrawn))
+    cuts = list(cuts_of(fold, spoilt))
+    if final and not localise:
+        reflected += [_reflected(each) for each in find_reflections(fold, _cut_robots(cuts))]
+    mirrored = {each.robot for each in reflected}
+    found = [*shared, *reflected, *(each for each in cuts if each.robot not in mirrored)]
     undecided = set() if final else _landmarks_of_saved_maps(fold)
     noise: list[m.Diagnosis] = []
     try:
@@ -167,9 +171,24 @@ def diagnose(
     return (*found, *noise)
 
 
+def _cut_robots(cuts: Sequence[m.Diagnosis]) -> list[str]:
+    return sorted({each.robot for each in cuts})
+
+
+def _reflected(found: Reflection) -> m.Diagnosis:
+    return m.Diagnosis(
+        cause="mirrored",
+        robot=found.robot,
+        value=(-1.0,),
+        sigma=(0.0,),
+        evidence=found.evidence,
+        remedy=MIRRORED_REMEDY,
+    )
+
+
 def doubt_signs(found: Sequence[m.Diagnosis]) -> list[m.Diagnosis]:
     """Add the signs of the bearings to the remedies of a robot that is carried off again and again,
-    as a mirrored one is without landmark names.
+    as a mirrored one of few landmarks is without their names.
     """
     jumps = Counter(
         each.robot for each in found if each.cause == hypotheses.CARRIED_OFF and each.at_ns

@@ -124,7 +124,7 @@ def test_wild_measurements_of_a_robot_for_a_while_are_no_fault_of_landmarks(tmp_
 
 
 def test_the_sign_of_the_bearings_is_doubted_where_a_robot_is_carried_off_three_times():
-    """Without landmark names nothing else shows a mirrored robot."""
+    """Without landmark names nothing else shows a mirrored robot that has few landmarks."""
     off = m.Diagnosis(cause="carried_off", robot="r2", remedy="leave it")
     once, start = (
         msgspec.structs.replace(off, robot="r1", at_ns=5),
@@ -139,6 +139,13 @@ def test_the_sign_of_the_bearings_is_doubted_where_a_robot_is_carried_off_three_
     for each in found[:3]:
         assert each.remedy.startswith("leave it; ")
         assert "check the sign of its bearings" in each.remedy
+
+
+def test_a_mirrored_robot_without_landmark_names_is_mirrored_and_not_carried_off(tmp_path):
+    world = StressWorld(seed=2, robots=2, landmarks=20, seconds=120.0, hidden=True)
+    found = diagnosed(scenario(replace(world, mirrored=("r2",)), tmp_path))
+    assert [(each.cause, each.robot) for each in found if each.robot] == [("mirrored", "r2")]
+    assert "negate the robot's bearings" in found[0].remedy
 
 
 def test_a_mirrored_robot_is_named_as_mirrored(tmp_path):

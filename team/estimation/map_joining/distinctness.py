@@ -317,7 +317,7 @@ def _align_beyond_chance(
     a, b = PointSet(own, np.zeros(len(own))), PointSet(others, np.zeros(len(others)))
     longest = float(np.ptp(np.concatenate((own, others)), axis=0).max())
     least = max(LEAST_PAIRS, LEAST_SHARE * min(len(own), len(others)))
-    radii = _list_radii(same)
+    radii = list_radii(same)
     most, found = BY_CHANCE - core.log(float(len(radii))), None
     for radius in radii:
         votes = propose_alignments(a, b, radius, longest)
@@ -330,7 +330,8 @@ def _align_beyond_chance(
     return found
 
 
-def _list_radii(same: float) -> list[float]:
+def list_radii(same: float) -> list[float]:
+    """List the radii from `same` down to the default profile's, each half of the one before."""
     radii = [same]
     while radii[-1] > DEFAULT_PROFILE.same:
         radii.append(max(0.5 * radii[-1], DEFAULT_PROFILE.same))
