@@ -11,8 +11,13 @@ import numpy as np
 
 from teamslam.sim.publisher.source import TRUTH_BATCH_NS, Source, for_the_evaluator
 from teamslam.sim.world.streams import WorldStreams
-from teamslam.team.driver.journal import FIRST_INCARNATION
-from teamslam.team.driver.node import BATCH, CREDIT_MEASUREMENTS, CREDIT_RECORDER, answer_request
+from teamslam.team.driver.source import (
+    BATCH,
+    CREDIT_MEASUREMENTS,
+    CREDIT_RECORDER,
+    FIRST_INCARNATION,
+    answer_request,
+)
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids

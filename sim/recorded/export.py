@@ -33,7 +33,7 @@ from teamslam.sim.recorded.chains import (
 from teamslam.sim.recorded.streams import recorded_streams
 from teamslam.team.config import UNNAMED
 from teamslam.team.core import predicted
-from teamslam.team.driver.journal import FIRST_INCARNATION
+from teamslam.team.driver.source import FIRST_INCARNATION
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.wire import channels as ch

@@ -21,11 +21,11 @@ from typing import Any, Literal
 import msgpack
 import msgspec
 
+from teamslam.team.driver.source import FIRST_INCARNATION
 from teamslam.team.wall_clock import wall_clock, was_set_since
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.codec import decoded
 
-FIRST_INCARNATION = 1
 Place = tuple[int, int]
 """(stamp [ns], kind): at equal stamps smaller kinds come first, odometry last."""
 

@@ -8,34 +8,21 @@ import msgspec
 from teamslam.team.config import RobotConfig
 from teamslam.team.door import absurd
 from teamslam.team.driver.journal import Journal
+from teamslam.team.driver.source import (
+    BATCH,
+    CREDIT_MEASUREMENTS,
+    CREDIT_RECORDER,
+    answer_request,
+    channel_of,
+)
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Outgoing
-from teamslam.team.wire.codec import decoded, encoded
+from teamslam.team.wire.codec import decoded
 
-CREDIT_MEASUREMENTS = 4096
-"""Most measurements that a source is ahead of its robot, while that is present."""
-CREDIT_RECORDER = 16384
-"""Most measurements, over all robots, that a source is ahead of a present recorder."""
-BATCH = 256  # measurements published between two checks of the inbox
-ANSWER = 8192  # most measurements in one answer to a query
 DAY_NS = 86_400 * 10**9
 Stream = tuple[int, int]  # (incarnation, measurements) that a receiver has consumed
-
-
-def channel_of(measurement: m.Measurement) -> ch.Channel:
-    """Return the channel on which a measurement is published."""
-    return next(row for row in ch.SENSORS if isinstance(measurement, row.kinds))
-
-
-def answer_request(
-    requested: m.MeasurementsRequest, count: int, measurement: Callable[[int], m.Measurement]
-) -> list[bytes]:
-    """Encode the requested ones of `count` measurements, at most ANSWER."""
-    last = count - 1 if requested.last < 0 else min(requested.last, count - 1)
-    last = min(last, requested.first + ANSWER - 1)
-    return [encoded(measurement(number)) for number in range(requested.first, last + 1)]
 
 
 class SourceNode:
