@@ -4,13 +4,13 @@ It is published as `Fault`, counted, and ignored when it is delivered again. An 
 ends the process.
 """
 
-import hashlib
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Protocol, TypeVar, runtime_checkable
 
+from teamslam.team.core import blake2b
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, opened
@@ -166,4 +166,4 @@ def _is_interrupt(error: BaseException | None) -> bool:
 
 
 def _name(sample: Sample) -> tuple[str, bytes]:
-    return sample.key, hashlib.blake2b(sample.payload, digest_size=8).digest()
+    return sample.key, blake2b(sample.payload, 8)

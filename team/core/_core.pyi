@@ -80,7 +80,7 @@ class Consensus:
         Begin a window. noise: as of `Window`; outlier_share: the share of measurements that are outliers.
         """
 
-    def add(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> None:
+    def add(self, keyframe: Keyframe) -> None:
         """
         Add a keyframe: the motion since the last one, then its measurements, if any.
         """
@@ -907,6 +907,24 @@ class Random:
     def normals(self, rows: int, columns: int) -> NDArray[numpy.float64]:
         """Draw standard normal numbers (rows, columns) (Box and Muller 1958)."""
 
+class Blake2b:
+    """An incremental BLAKE2b digest (RFC 7693) without a key."""
+
+    def __init__(self, digest_size: int, person: bytes = ...) -> None:
+        """person: at most 16 bytes, which separate uses."""
+
+    def update(self, data: bytes) -> None:
+        """Add bytes."""
+
+    def copy(self) -> Blake2b:
+        """Return an independent copy."""
+
+    def digest(self) -> bytes:
+        """Return the digest of all bytes so far."""
+
+def blake2b(data: bytes, digest_size: int, person: bytes = ...) -> bytes:
+    """Compute a BLAKE2b digest (RFC 7693); arguments as of `Blake2b`."""
+
 def effective_sample_size(log_weights: NDArray[numpy.float64]) -> float:
     """Compute 1/sum(w^2) of normalised log weights."""
 
@@ -997,26 +1015,24 @@ class Window:
     def of_particles(poses: NDArray[numpy.float64], log_weights: NDArray[numpy.float64], ids: NDArray[numpy.uint32], means: NDArray[numpy.float64], covariances: NDArray[numpy.float64], noise: Sequence[float], improved: bool = True) -> Window:
         """Make a window whose particles are these, without a keyframe."""
 
-    def advance(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], random: Random, shift: NDArray[numpy.float64] | None = None) -> Step:
+    def advance(self, keyframe: Keyframe, random: Random) -> Step:
         """
         Add a keyframe: the motion since the last one, then its measurements, if any.
 
-        own: (n, 4) covariances of the measurements, or (n, 0). The particles are
-        resampled first if too few are effective. random: draws a uniform number for that, then three normal ones
-        for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the
-        scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window unchanged.
+        The particles are resampled first if too few are effective. random: draws a uniform number for that, then
+        three normal ones for each particle. Raises MotionError, and leaves the window unchanged.
         """
 
-    def step(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64], normals: NDArray[numpy.float64]) -> float:
+    def step(self, keyframe: Keyframe, normals: NDArray[numpy.float64]) -> float:
         """
         Add a keyframe as `advance` does, without resampling and innovation; returns the log evidence.
 
         Raises MotionError, and leaves the window unchanged.
         """
 
-    def move(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], random: Random, shift: NDArray[numpy.float64] | None = None) -> None:
+    def move(self, rest: Keyframe, random: Random) -> None:
         """
-        Move the particles without a keyframe; the weights stay. random, shift: as of `advance`. Raises MotionError.
+        Move the particles by the motion after the last keyframe; the weights stay. Raises MotionError.
         """
 
     def mark(self, stamp_ns: int) -> None:
@@ -1024,7 +1040,7 @@ class Window:
         Make the particles' poses at the last keyframe a pose node at this team time [ns].
         """
 
-    def innovation(self, motion: NDArray[numpy.float64], covariance: NDArray[numpy.float64], ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64]) -> tuple[float, NDArray[numpy.float64], NDArray[numpy.float64]]:
+    def innovation(self, keyframe: Keyframe) -> tuple[float, NDArray[numpy.float64], NDArray[numpy.float64]]:
         """
         Predict the measurements of known landmarks; returns (v' inv(S) v, v, S), v = z - h. Raises MotionError.
         """

@@ -10,6 +10,7 @@ across the measured bearing. SENSOR: the sensor's noise, at the predicted range.
 """
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, Self
 
@@ -22,6 +23,7 @@ from teamslam.team.estimation.se2 import Pose
 from teamslam.team.shapes import Bool, Float
 
 LONGEST_NS = 2**62  # bound of the difference of two stamps
+UNSHIFTED = (0.0, 0.0, 0.0, 0.0)  # shift of a keyframe whose motion is calibrated
 _BOUNDS = Bounds()
 SENSOR, POLAR, POINT = -1.0, 0.0, 1.0
 Own = Float[np.ndarray, "_ _"]
@@ -46,6 +48,12 @@ class Increment(msgspec.Struct, frozen=True, gc=False):
         return Increment(
             *core.compose_motions(self.mean, self.covariance, other.mean, other.covariance)
         )
+
+    def keyframe(
+        self, scan: core.Scan | None = None, shift: Sequence[float] = UNSHIFTED
+    ) -> core.Keyframe:
+        """Make a keyframe of this motion and the measurements at its end; shift: as there."""
+        return core.Keyframe(0, (self.mean, self.covariance), scan, shift=shift)
 
 
 @lru_cache(maxsize=256)

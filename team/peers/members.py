@@ -1,9 +1,9 @@
 """A member of the team's set: a message's original bytes and its name in the set."""
 
-import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
+from teamslam.team.core import blake2b
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened
@@ -31,7 +31,7 @@ class Member:
     def hash(self) -> bytes:
         """32 bytes that identify key and payload."""
         named = len(self.key).to_bytes(2, "little") + self.key.encode() + self.payload
-        return hashlib.blake2b(named, digest_size=32).digest()
+        return blake2b(named, 32)
 
     @property
     def size(self) -> int:

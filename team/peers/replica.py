@@ -3,13 +3,13 @@
 Of two members of one name the smaller hash stays. The bytes about each robot are limited.
 """
 
-import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from typing import Literal, NamedTuple, TypeVar
 
 from teamslam.team.config import MAP
+from teamslam.team.core import blake2b
 from teamslam.team.door import MOST_COUNT, MOST_LIVES
 from teamslam.team.peers.members import Member, about
 from teamslam.team.store import Stream
@@ -266,8 +266,8 @@ class Replica:
                 *(h.digest for h in holdings.values()),
                 *(s.digest for s in statements.values()),
             ]
-            whole = hashlib.blake2b(b"".join(digests), digest_size=8)
-            self._announced = Announcement(whole.digest(), holdings, statements)
+            whole = blake2b(b"".join(digests), 8)
+            self._announced = Announcement(whole, holdings, statements)
         return self._announced
 
 
@@ -303,7 +303,7 @@ def _stated(message: m.Message) -> tuple[str, int]:
             named = f"{message.judgement} {message.withdrawn}".encode()
         case _:
             return kind, 0
-    return kind, int.from_bytes(hashlib.blake2b(named, digest_size=16).digest())
+    return kind, int.from_bytes(blake2b(named, 16))
 
 
 def _rank(member: Member) -> tuple[int, bytes]:
@@ -326,4 +326,4 @@ def _sum(members: Iterable[Member]) -> int:
 
 def _digest(total: int, members: Iterable[Member]) -> bytes:
     total = (total + _sum(members)) % _WORD
-    return hashlib.blake2b(total.to_bytes(32, "little"), digest_size=8).digest()
+    return blake2b(total.to_bytes(32, "little"), 8)

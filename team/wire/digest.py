@@ -1,9 +1,8 @@
 """Digests by which messages name their inputs, and the announcement of a configuration."""
 
-import hashlib
-
 import msgspec
 
+from teamslam.team.core import Blake2b
 from teamslam.team.wire import messages as m
 
 NO_MAP = bytes(8)  # the digest of no map
@@ -13,7 +12,7 @@ class Digest:
     """An incremental digest of byte strings."""
 
     def __init__(self) -> None:
-        self._hash = hashlib.blake2b(digest_size=8)
+        self._hash = Blake2b(8)
 
     def update(self, *parts: bytes) -> None:
         """Add byte strings, each with its length."""

@@ -52,6 +52,8 @@ EXAMPLES = {
     "what": lambda: "ranges",
     "key": lambda: bytes(range(16)),
     "random": lambda: core.Random(bytes(range(16))),
+    "digest_size": lambda: 8,
+    "person": lambda: b"a use",
     "noise": lambda: NOISE,
     **dict.fromkeys(("motion", "pose", "mount", "a_from_b", "a_from_c", "twist"), POSE.copy),
     **dict.fromkeys(("mean", "then", "shift", "xi", "observer", "teammate"), POSE.copy),
@@ -153,7 +155,6 @@ EXAMPLES = {
     **dict.fromkeys(("Window.mount", "OpenWindow.mount"), lambda: (0.1, 0.0, 0.2)),
     **dict.fromkeys(("resample_below", "max_range"), lambda: 0.5),
     **dict.fromkeys(("stamp_ns", "node_ns"), lambda: 10**18),
-    "keyframe": lambda: 0,
     **dict.fromkeys(("log_weights", "weights"), lambda: np.full(4, -1.4)),
     **{
         f"{each}.weights": lambda: np.full(4, 0.25)
@@ -161,10 +162,6 @@ EXAMPLES = {
     },
     "mean_direction.weights": lambda: np.ones(3),
     "normals": lambda: np.ones((4, 3)),
-    **{
-        f"{each}.shift": lambda: np.array([1.0, 0.0, 0.0, 0.5])
-        for each in ("Window.advance", "Window.move")
-    },
     "means": MEANS.copy,
     "covariances": COVARIANCES.copy,
     "paths": lambda: np.zeros((1, 4, 3)),
@@ -190,8 +187,9 @@ EXAMPLES = {
     "Keyframe.rest": lambda: (POSE, covariance(3)),
     "looks": lambda: [made("TimedScan")],
     "is_node": lambda: True,
-    "OpenWindow.advance.keyframe": lambda: made("Keyframe"),
-    "OpenWindow.move.rest": lambda: made("Keyframe"),
+    **dict.fromkeys(
+        ("keyframe", "Window.move.rest", "OpenWindow.move.rest"), lambda: made("Keyframe")
+    ),
     "OpenWindow.restart.keyframes": lambda: [made("Keyframe")],
     "segmenter": lambda: driven_segmenter(),
     "interval": lambda: made("OdometryInterval"),

@@ -22,6 +22,10 @@ UNCLAIMED = np.empty((2, 0))
 KEYFRAME = (MOTION, COVARIANCE, IDS, RANGES, BEARINGS, UNCLAIMED)
 
 
+def keyframe_of(mean, covariance, *scan: object) -> core.Keyframe:
+    return core.Keyframe(0, (mean, covariance), core.Scan(*scan))
+
+
 def opened(keyframes: int = 2, noise: tuple[float, ...] = NOISE) -> core.Window:
     window = core.Window(M, noise)
     for _ in range(keyframes):
@@ -31,7 +35,7 @@ def opened(keyframes: int = 2, noise: tuple[float, ...] = NOISE) -> core.Window:
 
 def advance(window: core.Window, keyframe: tuple[object, ...] = KEYFRAME) -> core.Step:
     """Take a keyframe with the same random numbers as any other."""
-    return window.advance(*keyframe, core.Random(KEY))
+    return window.advance(keyframe_of(*keyframe), core.Random(KEY))
 
 
 def bytes_of(window: core.Window) -> list[bytes]:
@@ -128,7 +132,7 @@ def test_the_window_of_a_mounted_sensors_base_neither_advances_nor_closes():
 def test_a_window_of_particles_goes_on_as_the_one_they_come_from():
     window = opened()
     again = core.Window.of_particles(*window.particles(), NOISE)
-    log = again.step(*KEYFRAME, NORMALS)
+    log = again.step(keyframe_of(*KEYFRAME), NORMALS)
     assert advance(window).log_evidence == log
     for one, other in zip(window.particles(), again.particles(), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -177,10 +181,11 @@ def test_windows_of_any_size_run_and_close(count, seed, improved, noise):
     for k in range(int(rng.integers(0, 5))):
         n = int(rng.integers(0, 6))
         own = np.column_stack((np.tile([0.1, 0.001, 0.02], (n, 1)), rng.integers(-1, 2, n)))
-        window.advance(
+        seen = keyframe_of(
             MOTION, COVARIANCE, rng.integers(0, 5, n).astype(np.uint32), rng.uniform(0.0, 20.0, n),
-            rng.uniform(-3.0, 3.0, n), own if seed % 3 else own[:, :0], random,
+            rng.uniform(-3.0, 3.0, n), own if seed % 3 else own[:, :0],
         )  # fmt: skip
+        window.advance(seen, random)
         if k % 2:
             window.mark(k)
         window.run()

@@ -79,14 +79,8 @@ def innovation(particles: Particles, step: RobotStep) -> Innovation:
     """
     with CoreErrors():
         window = core.Window.of_particles(*particles.arrays, noise_of(step.sensor))
-        squared, error, S = window.innovation(
-            step.increment.mean,
-            step.increment.covariance,
-            step.ids,
-            step.ranges,
-            step.bearings,
-            step.claims,
-        )
+        scan = core.Scan(step.ids, step.ranges, step.bearings, step.claims)
+        squared, error, S = window.innovation(step.increment.keyframe(scan))
     return _innovation_of(squared, error, S) if len(error) else NOTHING
 
 

@@ -21,13 +21,8 @@ void bind_consensus(nb::module_& m) {
           "noise"_a, "max_range"_a, "field_of_view"_a, "outlier_share"_a,
           "Begin a window. noise: as of `Window`; outlier_share: the share of measurements that are outliers.")
       .def(
-          "add",
-          [](Consensus& self, const se2::Pose<double>& motion, const linalg::Matrix3& covariance, const Ids& ids,
-             const Numbers& ranges, const Numbers& bearings, const Table& own) {
-            self.add({motion, covariance}, scan_of(ids, ranges, bearings, own));
-          },
-          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
-          "Add a keyframe: the motion since the last one, then its measurements, if any.")
+          "add", [](Consensus& self, const window::Keyframe& keyframe) { self.add(keyframe.motion, scan_of(keyframe)); },
+          "keyframe"_a, "Add a keyframe: the motion since the last one, then its measurements, if any.")
       .def("agreeing", &Consensus::agreeing,
            "Mark the measurements that agree with others of their landmark under the odometry alone.\n\n"
            "The measurement of a landmark that the others support best places it; it is accepted together with\n"

@@ -10,7 +10,7 @@
 
 namespace teamslam::binding {
 
-using window::Gaussian, window::Particles, window::Rows, window::Scan, window::Window;
+using window::Gaussian, window::Keyframe, window::Particles, window::Rows, window::Scan, window::Window;
 
 namespace {
 
@@ -258,44 +258,35 @@ void bind_window(nb::module_& m) {
           "Make a window whose particles are these, without a keyframe.")
       .def(
           "advance",
-          [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
-             const Numbers& bearings, const Table& own, random::Random& random, const std::optional<Quadruple>& shift) {
-            return self.advance(increment_of(motion, covariance, shift), scan_of(ids, ranges, bearings, own), random);
+          [](Window& self, const Keyframe& keyframe, random::Random& random) {
+            return self.advance(keyframe.increment(), scan_of(keyframe), random);
           },
-          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "random"_a, "shift"_a = nb::none(),
+          "keyframe"_a, "random"_a,
           "Add a keyframe: the motion since the last one, then its measurements, if any.\n\n"
-          "own: (n, 4) covariances of the measurements, or (n, 0). The particles are\n"
-          "resampled first if too few are effective. random: draws a uniform number for that, then three normal ones\n"
-          "for each particle. shift: of the motion's end, in (forward, left, turn), by an error of the\n"
-          "scale of speed, with the motion's duration [s]. Raises MotionError, and leaves the window unchanged.")
+          "The particles are resampled first if too few are effective. random: draws a uniform number for that, then\n"
+          "three normal ones for each particle. Raises MotionError, and leaves the window unchanged.")
       .def(
           "step",
-          [](Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
-             const Numbers& bearings, const Table& own, const Table& normals) {
-            return self.step(increment_of(motion, covariance), scan_of(ids, ranges, bearings, own),
-                             normals_of(normals, self.settings().particles));
+          [](Window& self, const Keyframe& keyframe, const Table& normals) {
+            return self.step(keyframe.increment(), scan_of(keyframe), normals_of(normals, self.settings().particles));
           },
-          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a, "normals"_a,
+          "keyframe"_a, "normals"_a,
           "Add a keyframe as `advance` does, without resampling and innovation; returns the log evidence.\n\n"
           "Raises MotionError, and leaves the window unchanged.")
       .def(
           "move",
-          [](Window& self, const Triple& motion, const Matrix3& covariance, random::Random& random,
-             const std::optional<Quadruple>& shift) { self.move(increment_of(motion, covariance, shift), random); },
-          "motion"_a, "covariance"_a, "random"_a, "shift"_a = nb::none(),
-          "Move the particles without a keyframe; the weights stay. random, shift: as of `advance`. Raises MotionError.")
+          [](Window& self, const Keyframe& rest, random::Random& random) { self.move(rest.increment(), random); }, "rest"_a,
+          "random"_a, "Move the particles by the motion after the last keyframe; the weights stay. Raises MotionError.")
       .def("mark", &Window::mark, "stamp_ns"_a, "Make the particles' poses at the last keyframe a pose node at this team time [ns].")
       .def(
           "innovation",
-          [](const Window& self, const Triple& motion, const Matrix3& covariance, const Ids& ids, const Numbers& ranges,
-             const Numbers& bearings, const Table& own) {
-            window::Innovation found = self.innovation(increment_of(motion, covariance), scan_of(ids, ranges, bearings, own));
+          [](const Window& self, const Keyframe& keyframe) {
+            window::Innovation found = self.innovation(keyframe.increment(), scan_of(keyframe));
             const std::size_t n = found.error.size();
             return std::tuple(found.squared, made_numbers(std::move(found.error)),
                               made<double, nb::ndim<2>>(std::move(found.S), {n, n}));
           },
-          "motion"_a, "covariance"_a, "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a,
-          "Predict the measurements of known landmarks; returns (v' inv(S) v, v, S), v = z - h. Raises MotionError.")
+          "keyframe"_a, "Predict the measurements of known landmarks; returns (v' inv(S) v, v, S), v = z - h. Raises MotionError.")
       .def("close", [](Window& self) { return made_gaussian(self.close()); },
            "Match moments with the landmarks solved again along the paths: the submap of the window.\n\n"
            "Returns ids, mean and covariance of (end pose, pose nodes, landmarks by ascending id), and the index in\n"

@@ -98,9 +98,6 @@ namespace teamslam::binding {
 using Numbers = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Table = nb::ndarray<const double, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Stack = nb::ndarray<const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
-using Triple = nb::ndarray<const double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
-using Quadruple = nb::ndarray<const double, nb::shape<4>, nb::c_contig, nb::device::cpu>;
-using Matrix3 = nb::ndarray<const double, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
 using Ids = nb::ndarray<const std::uint32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 template <class T, class Shape>
 using Made = nb::ndarray<nb::numpy, T, Shape, nb::c_contig>;

@@ -1,4 +1,4 @@
-// Poses, scans and the noise of a sensor from Python, for the bindings.
+// Scans, motions and the noise of a sensor from Python, for the bindings.
 #pragma once
 
 #include "binding.hpp"
@@ -6,11 +6,6 @@
 #include "segmenter.hpp"
 
 namespace teamslam::binding {
-
-template <class Array>
-se2::Pose<double> pose_of(const Array& pose) {
-  return {pose.data()[0], pose.data()[1], pose.data()[2]};
-}
 
 // (mean, covariance) of a motion.
 using MadeIncrement = std::tuple<se2::Pose<double>, linalg::Matrix3>;
@@ -47,19 +42,9 @@ inline std::span<const models::Claim> claims_of(const Table& own, std::size_t n)
   return {reinterpret_cast<const models::Claim*>(own.data()), n};
 }
 
-inline window::Scan scan_of(const Ids& ids, const Numbers& ranges, const Numbers& bearings, const Table& own) {
-  const std::size_t n = ids.size();
-  check(ranges.size() == n && bearings.size() == n, "ids, ranges and bearings must have one length");
-  return {{ids.data(), n}, finite(ranges, "ranges"), finite(bearings, "bearings"), claims_of(own, n)};
-}
-
-inline window::Increment increment_of(const Triple& mean, const Matrix3& covariance, const std::optional<Quadruple>& shift = std::nullopt) {
-  window::Increment increment{{mean(0), mean(1), mean(2)}, std::span<const double, 9>(covariance.data(), 9)};
-  if (shift) {
-    increment.shift = {(*shift)(0), (*shift)(1), (*shift)(2)};
-    increment.seconds = (*shift)(3);
-  }
-  return increment;
+inline window::Scan scan_of(const window::Keyframe& keyframe) {
+  if (!keyframe.seen.is_finite()) throw NotFiniteError("measurements must be finite");
+  return keyframe.seen.view();
 }
 
 constexpr std::size_t MOST_PARTICLES = 10'000'000;

@@ -5,6 +5,7 @@
 namespace teamslam::window {
 
 using models::Polar;
+using pack::Pack, pack::WIDTH;
 using se2::Point;
 
 namespace {
@@ -55,32 +56,100 @@ Covariance2 spread_by(const Jacobian& J, const double (&P)[5][5]) {
   return S;
 }
 
-// log N(e; 0, S).
-double log_density(double e0, double e1, const Covariance2& S) {
-  const double determinant = S.determinant();
-  const double squared = (S.bb * e0 * e0 - 2.0 * S.rb * e0 * e1 + S.rr * e1 * e1) / determinant;
-  return -0.5 * (squared + elementary::log(determinant)) - models::LOG_2_PI;
+double log(double x) { return elementary::log(x); }
+Pack log(const Pack& x) {
+  double numbers[WIDTH], logs[WIDTH];
+  pack::store(numbers, x);
+  pack::store(logs, elementary::log_of_normal(x));
+  for (std::size_t i = 0; i < WIDTH; i++)
+    if (!(numbers[i] > 1e-300 && numbers[i] < 1e300)) logs[i] = elementary::log(numbers[i]);
+  return pack::load(logs);
 }
+
+// log N(e; 0, S), S = (rr, rb, bb).
+template <class T>
+T log_density(const T& e0, const T& e1, const T& rr, const T& rb, const T& bb) {
+  const T determinant = rr * bb - rb * rb;
+  const T squared = (bb * e0 * e0 - 2.0 * rb * e0 * e1 + rr * e1 * e1) / determinant;
+  return -0.5 * (squared + log(determinant)) - models::LOG_2_PI;
+}
+double log_density(double e0, double e1, const Covariance2& S) { return log_density(e0, e1, S.rr, S.rb, S.bb); }
 
 // a_from_b of b_from_a: (T Exp ξ)⁻¹ = T⁻¹ Exp(−Ad(T) ξ).
 motion::Increment reversed(const motion::Increment& motion) {
   return motion::compose({{}, motion.covariance}, motion::Step({se2::inverse(motion.mean), {}}));
 }
 
-// The log p(z | another measurement of the landmark, odometry); motion: from where that one was read.
+// A measurement, and another one of its landmark: where that one places it, and the motion since then.
+struct Pair {
+  const Reading& z;
+  const models::Landmark<double>& at;
+  const motion::Increment& motion;
+};
+
+// The log p(z | the other measurement, odometry) of pairs in the lanes of a T.
 //
 // The landmark is where the other one places it, with its noise, and is looked at after the odometry, with
-// its noise and the measurement's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ.
-double log_likelihood(const Reading& z, const models::Landmark<double>& at, const motion::Increment& motion) {
-  const Polar predicted = models::polar(motion.mean, {at.x, at.y});
-  double P[5][5] = {};
-  for (std::size_t i = 0; i < 3; i++) std::copy(motion.covariance[i], motion.covariance[i] + 3, P[i]);
-  P[3][3] = at.xx;
-  P[3][4] = P[4][3] = at.xy;
-  P[4][4] = at.yy;
-  const Covariance2 S = spread_by(jacobian_of(predicted, motion.mean.heading), P);
-  const auto [e0, e1, rr, rb, bb] = models::innovation_of(z, predicted);
-  return log_density(e0, e1, {S.rr + rr, S.rb + rb, S.bb + bb});
+// its noise and the measurement's: S = R + Hₓ C Hₓᵀ + Hₗ Σ Hₗᵀ. number(f): f of each pair. innovation: z − h
+// and its noise, of h.
+template <class T, class Number, class Innovation>
+T log_likelihood(Number&& number, Innovation&& innovation) {
+  const auto of_motion = [&](auto f) { return number([&](const Pair& each) { return f(each.motion.mean); }); };
+  const auto of_place = [&](auto f) { return number([&](const Pair& each) { return f(each.at); }); };
+  const Pose<T> pose{of_motion([](const auto& x) { return x.x; }), of_motion([](const auto& x) { return x.y; }),
+                     of_motion([](const auto& x) { return x.heading; })};
+  const models::Line<T> line = models::line_to(pose, of_place([](const auto& at) { return at.x; }), of_place([](const auto& at) { return at.y; }));
+  const T distance = line.distance, bearing = se2::wrapped(T(line.direction - pose.heading));
+  const auto [s, c] = elementary::sin_cos_near(bearing);
+  const auto [ey, ex] = elementary::sin_cos_near(T(pose.heading + bearing));
+  const T range_by[5] = {-c, -s, T{}, ex, ey};
+  const T bearing_by[5] = {s / distance, -c / distance, pack::all<T>(-1.0), -ey / distance, ex / distance};
+  T S_rr{}, S_rb{}, S_bb{};
+  const auto add = [&](std::size_t p, std::size_t q, const T& covariance) {
+    const T of_range = range_by[p] * covariance;
+    S_rr += of_range * range_by[q];
+    S_rb += of_range * bearing_by[q];
+    S_bb += bearing_by[p] * covariance * bearing_by[q];
+  };
+  for (std::size_t p = 0; p < 3; p++)
+    for (std::size_t q = 0; q < 3; q++) add(p, q, number([&](const Pair& each) { return each.motion.covariance[p][q]; }));
+  const T xy = of_place([](const auto& at) { return at.xy; });
+  add(3, 3, of_place([](const auto& at) { return at.xx; }));
+  add(3, 4, xy);
+  add(4, 3, xy);
+  add(4, 4, of_place([](const auto& at) { return at.yy; }));
+  const auto [e0, e1, rr, rb, bb] = innovation(distance, bearing);
+  return log_density(e0, e1, T(S_rr + rr), T(S_rb + rb), T(S_bb + bb));
+}
+
+std::vector<double> log_likelihoods(std::span<const Pair> pairs) {
+  std::vector<double> logs(pack::padded(pairs.size()));
+  for (std::size_t k = 0; k < pairs.size(); k += WIDTH) {
+    const std::span<const Pair> some = pairs.subspan(k, std::min(WIDTH, pairs.size() - k));
+    if (std::any_of(some.begin(), some.end(), [](const Pair& each) { return each.z.is_point; })) {
+      for (std::size_t i = 0; i < some.size(); i++)
+        logs[k + i] = log_likelihood<double>(
+            [&](auto f) { return f(some[i]); },
+            [&](double distance, double bearing) { return models::innovation_of(some[i].z, Polar{distance, bearing}); });
+      continue;
+    }
+    const auto number = [&](auto f) {
+      double lanes[WIDTH];
+      for (std::size_t i = 0; i < WIDTH; i++) lanes[i] = f(some[std::min(i, some.size() - 1)]);
+      return pack::load(lanes);
+    };
+    const auto of_reading = [&](auto f) { return number([&](const Pair& each) { return f(each.z); }); };
+    const auto innovation = [&](const Pack& distance, const Pack& bearing) {
+      const Pack off = se2::wrapped(Pack(of_reading([](const Reading& z) { return z.bearing; }) - bearing));
+      const Pack per_m2 = of_reading([](const Reading& z) { return z.rr_per_m2; });
+      return models::Innovation<Pack>{of_reading([](const Reading& z) { return z.range; }) - distance, off,
+                                      of_reading([](const Reading& z) { return z.rr; }) + per_m2 * distance * distance,
+                                      of_reading([](const Reading& z) { return z.rb; }), of_reading([](const Reading& z) { return z.bb; })};
+    };
+    pack::store(&logs[k], log_likelihood<Pack>(number, innovation));
+  }
+  logs.resize(pairs.size());
+  return logs;
 }
 
 // Log odds that a measurement is good, for this share of outliers.
@@ -119,16 +188,18 @@ void Consensus::add(const motion::Increment& motion, const Scan& scan) {
     farthest_ = std::max(farthest_, reading.range);
     const models::Landmark<double> placed = models::place(Pose<double>{}, reading);
     Landmark& landmark = landmarks_[scan.ids[k]];
-    std::vector<double> of_others;
     const bool may_place = landmark.logs.size() < MOST_COMPARED;
+    std::vector<Pair> by_others, of_others;
     for (std::size_t i = 0; i < landmark.logs.size(); i++) {
       const Measurement& other = measurements_[landmark.measurements[i]];
-      landmark.logs[i].push_back(log_likelihood(reading, other.placed, to_last_[other.scan]));
-      if (may_place) of_others.push_back(log_likelihood(other.reading, placed, from_last[other.scan]));
+      by_others.push_back({reading, other.placed, to_last_[other.scan]});
+      if (may_place) of_others.push_back({other.reading, placed, from_last[other.scan]});
     }
+    const std::vector<double> by_each = log_likelihoods(by_others);
+    for (std::size_t i = 0; i < by_each.size(); i++) landmark.logs[i].push_back(by_each[i]);
     if (may_place) {
-      of_others.push_back(0.0);
-      landmark.logs.push_back(std::move(of_others));
+      landmark.logs.push_back(log_likelihoods(of_others));
+      landmark.logs.back().push_back(0.0);
     }
     landmark.measurements.push_back(size());
     measurements_.push_back({b, reading, placed});

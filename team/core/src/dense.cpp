@@ -35,10 +35,14 @@ Matrix transposed(Const a) {
 }
 
 bool is_finite(Const a) {
-  for (std::size_t i = 0; i < a.rows; i++)
-    for (std::size_t j = 0; j < a.columns; j++)
-      if (!std::isfinite(a[i][j])) return false;
-  return true;
+  double lost[8] = {};  // 0 · x is no number where x is not finite
+  for (std::size_t i = 0; i < a.rows; i++) {
+    std::size_t j = 0;
+    for (; j + 8 <= a.columns; j += 8)
+      for (std::size_t lane = 0; lane < 8; lane++) lost[lane] += 0.0 * a[i][j + lane];
+    for (; j < a.columns; j++) lost[0] += 0.0 * a[i][j];
+  }
+  return std::all_of(lost, lost + 8, [](double x) { return x == 0.0; });
 }
 
 double inner(std::span<const double> a, std::span<const double> b) {

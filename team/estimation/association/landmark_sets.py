@@ -5,7 +5,6 @@ of its smallest member, or the name of a named landmark. All of this depends onl
 which submaps are added.
 """
 
-import hashlib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from teamslam.team.config import UNNAMED
+from teamslam.team.core import blake2b
 from teamslam.team.estimation.association.member_log import (
     LocalLandmark,
     MemberLog,
@@ -195,7 +195,7 @@ def _choose_numbers(log: MemberLog, members: Sequence[LocalLandmark]) -> list[in
 
 def number_of(member: LocalLandmark) -> int:
     """Hash a member's name: 2³¹ | 31 bits of its BLAKE2b digest."""
-    digest = hashlib.blake2b(str(member).encode(), digest_size=4).digest()
+    digest = blake2b(str(member).encode(), 4)
     return UNNAMED | int.from_bytes(digest, "little") & (UNNAMED - 1)
 
 

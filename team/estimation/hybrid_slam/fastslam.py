@@ -14,7 +14,7 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.core import effective_sample_size, systematic_parents
 from teamslam.team.estimation.gaussian import CoreErrors
-from teamslam.team.estimation.models import Increment, Own, noise_of, unclaimed
+from teamslam.team.estimation.models import Increment, Own, noise_of
 from teamslam.team.shapes import Float, Int64, UInt32
 
 Proposal = Literal["fastslam2", "fastslam1"]
@@ -128,14 +128,13 @@ def filter_step(
     own: Own | None = None,
 ) -> tuple[Particles, float]:
     """As `propagated_and_updated` without resampling; return also the log evidence."""
-    noises = unclaimed(len(ids)) if own is None else own
     normals = generator.standard_normal((len(particles.poses), 3))
     with CoreErrors():
         window = core.Window.of_particles(
             *particles.arrays, noise_of(sensor), proposal == "fastslam2"
         )
         log_evidence = window.step(
-            increment.mean, increment.covariance, ids, ranges, bearings, noises, normals
+            increment.keyframe(core.Scan(ids, ranges, bearings, own)), normals
         )
     return Particles(*window.particles()), log_evidence
 

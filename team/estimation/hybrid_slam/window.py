@@ -5,7 +5,6 @@ landmark of each particle is solved again along its path: an EKF is linearised a
 noisiest measurement, a bias common to many submaps (Brooks and Bailey 2009, HybridSLAM).
 """
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,12 +18,10 @@ from teamslam.team.estimation import dense
 from teamslam.team.estimation.gaussian import FAULTS, CoreErrors, NotACovarianceError
 from teamslam.team.estimation.hybrid_slam.fastslam import Particles
 from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
-from teamslam.team.estimation.models import Increment, Own, noise_of, unclaimed
+from teamslam.team.estimation.models import UNSHIFTED, Increment, Own, noise_of
 from teamslam.team.estimation.se2 import tangent
 from teamslam.team.estimation.submap import Became, LocalMap, Slipped
 from teamslam.team.shapes import Float, Int64, UInt32
-
-STILL = np.zeros(4)
 
 
 class Innovation(NamedTuple):
@@ -131,11 +128,8 @@ def generator(seed: int, robot: str, incarnation: int, sequence: int) -> "np.ran
 
 
 def _key(seed: int, robot: str, incarnation: int, sequence: int) -> bytes:
-    return hashlib.blake2b(
-        f"{seed}/{robot}/{incarnation}/{sequence}".encode(),
-        digest_size=16,
-        person=b"teamslam window",
-    ).digest()
+    named = f"{seed}/{robot}/{incarnation}/{sequence}".encode()
+    return core.blake2b(named, 16, b"teamslam window")
 
 
 def open_window(front_end: FrontEnd, sensor: Sensor) -> Window:
@@ -157,7 +151,7 @@ def advance(
     ranges: Float[np.ndarray, " n"],
     bearings: Float[np.ndarray, " n"],
     random: core.Random,
-    forward: Float[np.ndarray, "4"] = STILL,
+    forward: Sequence[float] = UNSHIFTED,
     *,
     own: Own | None = None,
 ) -> None:
@@ -165,12 +159,13 @@ def advance(
 
     The measurements are accepted and corrected (`models.scanned`). The innovation omits those of
     singular predictive covariance. forward: the motion's shift by an error of the scale of speed,
-    and its duration (`core.Odometry`). own: claimed noises (`teamslam.team.estimation.models`).
+    and its duration [s] (`core.Keyframe`). own: claimed noises (`teamslam.team.estimation.models`).
     Raises NotACovarianceError, and leaves the window unchanged.
     """
-    seen = ids, ranges, bearings, unclaimed(len(ids)) if own is None else own
     with CoreErrors():
-        window.core.advance(increment.mean, increment.covariance, *seen, random, forward)
+        window.core.advance(
+            increment.keyframe(core.Scan(ids, ranges, bearings, own), forward), random
+        )
 
 
 def gaussian(window: Window) -> LocalMap:

@@ -9,7 +9,6 @@ The attachment of a publication has 32 bytes, `<qqq8s`: team time [ns], the publ
 link is cut can arrive under another key. The length is the version of the format.
 """
 
-import hashlib
 import struct
 from collections.abc import Callable
 from functools import lru_cache
@@ -19,6 +18,7 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
+from teamslam.team.core import blake2b
 from teamslam.team.wire.bus import WHOLE_CACHE, cache_size
 from teamslam.team.wire.channels import Channel, row_of
 
@@ -47,7 +47,7 @@ class AttachmentError(ValueError):
 @lru_cache(maxsize=4096)
 def hash_of(key: str) -> bytes:
     """Return the 8-byte hash of a whole key, with its `team/<team>/`."""
-    return hashlib.blake2b(key.encode(), digest_size=8).digest()
+    return blake2b(key.encode(), 8)
 
 
 def pack(key: str, attachment: Attachment) -> bytes:

@@ -1,9 +1,7 @@
 import numpy as np
 
 from teamslam.team import core
-from teamslam.team.estimation.models import Noise
-
-STILL = np.zeros(3), np.zeros((3, 3))
+from teamslam.team.estimation.models import Increment, Noise
 
 
 def updated(mean, packed, pose, seen, sensor, own) -> tuple[np.ndarray, np.ndarray, float]:
@@ -20,6 +18,7 @@ def _stepped(pose, known, seen, sensor, own) -> tuple[np.ndarray, np.ndarray, fl
     at = np.array([pose], np.float64), np.zeros(1)
     window = core.Window.of_particles(*at, *known, noise, improved=False)
     ids, ranges, bearings = np.array([7], np.uint32), seen[0][:1], seen[1][:1]
-    log = window.step(*STILL, ids, ranges, bearings, own[:1], np.zeros((1, 3)))
+    scan = core.Scan(ids, ranges, bearings, own[:1])
+    log = window.step(Increment.identity().keyframe(scan), np.zeros((1, 3)))
     _, _, _, means, covariances = window.particles()
     return means[0, 0], covariances[0, 0], log

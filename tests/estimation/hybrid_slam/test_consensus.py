@@ -36,7 +36,7 @@ class Drive:
         for k, motion in enumerate(self.motions):
             at = self.keyframes == k
             ranges, bearings = self.measurements[at].T
-            consensus.add(motion.mean, motion.covariance, self.ids[at], ranges, bearings, own[at])
+            consensus.add(motion.keyframe(core.Scan(self.ids[at], ranges, bearings, own[at])))
         taken = np.zeros(len(self.ids), dtype=np.bool_)
         taken[np.argsort(self.keyframes, kind="stable")] = getattr(consensus, by)()
         return taken

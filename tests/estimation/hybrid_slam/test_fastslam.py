@@ -7,7 +7,7 @@ from teamslam.team import core
 from teamslam.team.config import Sensor
 from teamslam.team.core import moments
 from teamslam.team.estimation.hybrid_slam import fastslam
-from teamslam.team.estimation.models import Increment, Noise, unclaimed
+from teamslam.team.estimation.models import Increment, Noise
 from tests.estimation.submap_world import wrap
 
 quick = settings(deadline=None, max_examples=60)
@@ -187,10 +187,9 @@ def test_resampling_is_unbiased_and_never_off_by_one_copy(log_weights):
 
 def factor_of_motion(covariance):
     """L of three particles at zero that move by Exp(L n), n short along each axis."""
-    zero, none, small = np.zeros(3), np.empty(0), 1e-30
+    small = 1e-30
     window = core.Window(3, (0.01, 0.0, 1.0, 1e-3, 1.0))
-    ids, own = np.empty(0, np.uint32), np.empty((0, 0))
-    window.step(zero, covariance, ids, none, none, own, small * np.eye(3))
+    window.step(Increment(np.zeros(3), covariance).keyframe(), small * np.eye(3))
     return window.particles()[0].T / small
 
 
@@ -221,7 +220,7 @@ def test_a_particle_s_step_depends_neither_on_its_place_nor_on_the_others():
         known = np.array([4], np.uint32), means[order, :1], spread[order, :1]
         weights = np.full(len(order), -np.log(len(order)))
         window = core.Window.of_particles(starts[order], weights, *known, noise)
-        log_sum = window.step(MOTION.mean, MOTION.covariance, *seen, unclaimed(3), normals[order])
+        log_sum = window.step(MOTION.keyframe(core.Scan(*seen)), normals[order])
         poses, logs, _, placed, spread_after = window.particles()
         return poses, placed, spread_after, logs + log_sum + np.log(len(order))
 

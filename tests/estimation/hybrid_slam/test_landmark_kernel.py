@@ -5,6 +5,7 @@ import pytest
 
 from teamslam.team import core
 from teamslam.team.core import predicted
+from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential, inverse, tangent, wrapped
 from tests.estimation.hybrid_slam import one_landmark
 
@@ -83,7 +84,7 @@ def least_prior(
         consensus = core.Consensus(noise, 1e6, FIELD, 1.0 / (1.0 + math.exp(prior)))
         for step, each in ((np.zeros((4, 3)), z[0]), (np.vstack((motion, covariance)), z[1])):
             seen = np.array([7], np.uint32), each[:1], each[1:], own.reshape(1, -1)
-            consensus.add(step[0], step[1:], *seen)
+            consensus.add(Increment(step[0], step[1:]).keyframe(core.Scan(*seen)))
         taken = consensus.agreeing()
         assert taken.all() or not taken.any()
         none, some = (none, prior) if taken.all() else (prior, some)

@@ -58,7 +58,7 @@ def window_of(bearing, clock_offset, forward_scale, range_offset, range_scale, w
             ranges[seen] * (1.0 + range_scale) + range_offset,
             bearings + bearing,
             random,
-            shift_of(MOTION, (1.0, 1.0, 0.1)),
+            shift_of(MOTION, (1.0, 1.0, 0.1)).tolist(),
         )
     return windows.gaussian(window)
 
@@ -106,7 +106,7 @@ def some_window(seed, sensor, mark=(), mount=(0.0, 0.0, 0.0)):
         if k == 3:
             own = np.array([[0.05, 0.006, 0.002, 0.0], [0.0, 0.0, 0.0, -1.0]])
         shift = np.append(rng.normal(size=3), rng.uniform(0.2, 1.0))
-        window.advance(step.mean, step.covariance, ids, ranges, bearings, own, random, shift)
+        window.advance(step.keyframe(core.Scan(ids, ranges, bearings, own), shift.tolist()), random)
         motions.append((step.covariance, shift))
         if k in mark:
             window.mark(k)

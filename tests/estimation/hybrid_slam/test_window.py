@@ -67,7 +67,7 @@ def driven(run, sensor, particles=100, seed=0, motion=ROBOT, twice=False, **fron
 
 def move(window, motion, seed):
     random = random_numbers(seed, "a", 0, 0)
-    window.core.move(motion.mean, motion.covariance, random)
+    window.core.move(motion.keyframe(), random)
 
 
 def bytes_of(window):
