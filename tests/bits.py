@@ -105,11 +105,7 @@ def _hash(data: bytes) -> str:
 
 
 def machine() -> dict[str, str]:
-    return {
-        "processor": platform.machine(),
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-    }
+    return {"processor": platform.machine(), "numpy": np.__version__, "scipy": scipy.__version__}
 
 
 def table() -> dict[str, dict[str, str]]:

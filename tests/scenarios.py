@@ -1,8 +1,11 @@
+import dataclasses
 from pathlib import Path
 
+import numpy as np
 from msgspec.structs import replace
 
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
+from teamslam.sim.world.streams import Detections
 
 NEVER_S = 1e6
 
@@ -29,3 +32,14 @@ def final_only(scenario: Scenario) -> Scenario:
 
 def scenario_in(folder: Path) -> Scenario:
     return with_options(load(folder / "scenario.toml"), dataset=folder)
+
+
+def selected(seen: Detections, chosen: np.ndarray) -> Detections:
+    """The chosen detections, in the same scans."""
+    scan = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
+    counts = np.bincount(scan[chosen], minlength=len(seen.stamps_ns))
+    offsets = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+    names = ("ids", "ranges", "bearings")
+    return dataclasses.replace(
+        seen, offsets=offsets, **{name: getattr(seen, name)[chosen] for name in names}
+    )

@@ -197,12 +197,7 @@ def measured_examples() -> Iterator[m.Message]:
         classes=CLASSES,
     )
     yield alpha(
-        m.Sightings,
-        stamp_ns=3_000,
-        number=4,
-        teammates=("bravo",),
-        ranges=[6.0],
-        bearings=[-3.0],
+        m.Sightings, stamp_ns=3_000, number=4, teammates=("bravo",), ranges=[6.0], bearings=[-3.0]
     )
     yield alpha(m.Truth, stamp_ns=4_000, stamps=[0, 4_000], poses=range(6))
     yield alpha(m.TruthLandmarks, stamp_ns=-5)

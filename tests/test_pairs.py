@@ -30,14 +30,8 @@ def test_each_method_is_in_a_pair_and_pairs_name_rows_only():
 
 
 def test_a_rule_and_an_estimator_are_a_file_and_a_row_each_and_their_runs_verify(tmp_path):
-    said = subprocess.run(
-        [sys.executable, "-m", "tests.recipes.walk", str(tmp_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300.0,
-        check=False,
-    )
+    command = [sys.executable, "-m", "tests.recipes.walk", str(tmp_path)]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300.0)
     assert said.returncode == 0, said.stderr[-2000:]
     first, second = said.stdout.splitlines()
     assert first.startswith("first-submaps"), first

@@ -44,6 +44,13 @@ def closure(*roots: str) -> set[str]:
     return found - {"teamslam"}
 
 
+def python(code: str, **options: object) -> str:
+    command = [sys.executable, "-c", code]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
 def tracked() -> list[Path]:
     git = shutil.which("git")
     if git is None or not (ROOT / ".git").exists():
@@ -143,11 +150,8 @@ def test_a_process_loads_nothing_that_it_does_not_use_until_it_connects(words, u
         "try: main.main()\n"
         "finally: print(*(name for name, module in sys.modules.items() if module))"
     )
-    ran = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path
-    )
-    loaded = set(ran.stdout.splitlines()[-1].split())
-    assert any(each.startswith("teamslam.team.wire.zenoh.") for each in loaded), ran.stderr
+    loaded = set(python(code, cwd=tmp_path).splitlines()[-1].split())
+    assert any(each.startswith("teamslam.team.wire.zenoh.") for each in loaded)
     unused |= {"jaxtyping", "scipy", "matplotlib", "rich", "teamslam.sim.cli.log"}
     assert loaded.isdisjoint(unused)
 
@@ -163,14 +167,13 @@ def test_a_process_loads_nothing_that_it_does_not_use_until_it_connects(words, u
     ],
 )
 def test_a_launch_and_a_driver_begin_without_what_they_need_later_or_never(imported, unused):
-    code = f"import sys, {imported}; print(*sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert set(ran.stdout.split()).isdisjoint(unused | {"cryptography.x509", "mcap"})
+    loaded = python(f"import sys, {imported}; print(*sys.modules)").split()
+    assert set(loaded).isdisjoint(unused | {"cryptography.x509", "mcap"})
 
 
 def test_the_commands_alone_load_no_numpy():
     code = "import sys; from teamslam.sim.cli.main import load_all; load_all(); print(*sys.modules)"
-    loaded = subprocess.check_output([sys.executable, "-c", code], text=True, timeout=60).split()
+    loaded = python(code).split()
     assert "teamslam.sim.studies.experiment_command" in loaded
     assert {"numpy", "rich.progress"}.isdisjoint(loaded)
 
@@ -184,7 +187,7 @@ def test_a_launch_and_its_report_need_no_scipy():
     )  # fmt: skip
     code = "import sys; sys.modules['scipy'] = None\n"
     code += "".join(f"import teamslam.{part}\n" for part in parts)
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    python(code)
     assert "scipy" not in closure(*PROJECT["dependencies"])
 
 
@@ -201,10 +204,7 @@ def test_the_linear_algebra_of_a_command_has_one_thread():
         "print(len(os.listdir('/proc/self/task')))"
     )
     bare = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    ran = subprocess.run(
-        [sys.executable, "-c", code], env=bare, capture_output=True, text=True, timeout=60
-    )
-    assert ran.stdout == "1\n", ran.stderr
+    assert python(code, env=bare) == "1\n"
 
 
 def test_an_extra_is_installed_by_its_packages_wherever_we_come_from(monkeypatch):
@@ -225,10 +225,8 @@ def test_the_settings_of_make_s_installation_are_known_to_the_build(tmp_path):
     named = re.findall(r"--config-settings (\S+)=(\S+)", (ROOT / "Makefile").read_text())
     assert named
     code = "import sys; from scikit_build_core import build; "
-    code += f"build.prepare_metadata_for_build_editable(sys.argv[1], {dict(named)!r})"
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert ran.returncode == 0, ran.stderr
+    code += f"build.prepare_metadata_for_build_editable({str(tmp_path)!r}, {dict(named)!r})"
+    python(code, cwd=ROOT)
     assert list(tmp_path.glob("teamslam-*.dist-info"))
 
 
@@ -290,7 +288,4 @@ def test_commands_are_there_without_the_packages_of_extras(tmp_path):
         "sys.argv = ['teamslam', 'experiment', '--help']\n"
         "from teamslam.sim.cli.main import main; main()"
     )
-    ran = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path
-    )
-    assert "accuracy" in ran.stdout, ran.stderr
+    assert "accuracy" in python(code, cwd=tmp_path)

@@ -28,10 +28,16 @@ class Waiting:
         return build.status(node="world", state=self.state, warnings=("waiting for robot/r2",))
 
 
-def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(monkeypatch, caplog):
+@pytest.fixture
+def clock(monkeypatch):
+    """A list of the present time [s]."""
+    now = [100.0]
+    monkeypatch.setattr(shell.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_node_that_waits_is_heard_of_again_and_again_until_it_works(clock, caplog):
     caplog.set_level(logging.INFO, "teamslam")
-    clock = [100.0]
-    monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
     node = Waiting()
     turning = Shell(MemoryBus(MemoryNetwork()), node, "world", threading.Event())
     said = []
@@ -57,16 +63,23 @@ class Slow(MemoryBus):
         return super().receive(timeout_s)
 
 
-@pytest.mark.parametrize("case", ["nobody records", "all is there", "lacks", "away", "back"])
-def test_a_process_stays_while_who_records_may_still_ask_for_something(case, monkeypatch):
-    """It leaves at once without a recorder, or when the recorder has everything."""
-    clock = [100.0]
-    monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
+@pytest.fixture
+def beside_recorder(clock):
+    """Buses of a process and of its recorder."""
     network = MemoryNetwork()
     bus, recorder = Slow(network, clock), MemoryBus(network)
+    bus.watch_alive(RECORDER)
+    return network, bus, recorder
+
+
+@pytest.mark.parametrize("case", ["nobody records", "all is there", "lacks", "away", "back"])
+def test_a_process_stays_while_who_records_may_still_ask_for_something(
+    case, clock, beside_recorder
+):
+    """It leaves at once without a recorder, or when the recorder has everything."""
+    network, bus, recorder = beside_recorder
     if case != "nobody records":
         recorder.declare_alive(RECORDER)
-    bus.watch_alive(RECORDER)
     turning = Shell(bus, Waiting(), "robot/r1", threading.Event())
     if case == "away":
         recorder.close()
@@ -82,18 +95,14 @@ def test_a_process_stays_while_who_records_may_still_ask_for_something(case, mon
 
 @pytest.mark.parametrize("case", ["no report", "gets on", "gets no further", "an earlier life's"])
 def test_a_process_stays_for_a_recorder_that_gets_on_and_leaves_one_that_does_not(
-    case, monkeypatch
+    case, clock, beside_recorder
 ):
     """A missing report means that the recorder has not read it yet."""
-    clock = [100.0]
-    monkeypatch.setattr(shell.time, "monotonic", lambda: clock[0])
-    network = MemoryNetwork()
-    bus, recorder = Slow(network, clock), MemoryBus(network)
+    _, bus, recorder = beside_recorder
     key = ch.TRAJECTORY.key("r1")
     totals = build.tally(node="central", since_ns=7, keys=(key,), counts=(9,))
     bus.publish_totals = lambda: totals
     recorder.declare_alive(RECORDER)
-    bus.watch_alive(RECORDER)
     turning = Shell(bus, Waiting(), "central", threading.Event())
     turning.take(MemoryBus.receive(bus))
 

@@ -28,11 +28,15 @@ def world():
     return [message(each.sequence, each.end_ns, each.local) for each in submaps], truth
 
 
+def uneven_ring(rng, radius):
+    angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
 @pytest.fixture(scope="module")
 def cluttered():
     rng = np.random.default_rng(6)
-    angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
-    landmarks = 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    landmarks = uneven_ring(rng, 10.0)
     submaps, truth = drive("r1", circle((0.0, 0.0), 3.0, 80, 5.0), landmarks, rng, reach=20.0)
     return [
         message(each.sequence, each.end_ns, with_clutter(each.local, rng) if k % 2 else each.local)
@@ -76,12 +80,17 @@ def all_said(cluttered, _small):
     return folded(messages)
 
 
-def folded(messages, bounded=True, watermarks=()):
+def folded(messages, bounded=True, watermarks=(), late=None):
+    """late: number of a message that comes after the others."""
     ticks = TickFold(CONFIG, SMALL if bounded else None)
     for k, each in enumerate(messages):
-        ticks.add_submap(each, digest_of(encoded(each)))
+        if k != late:
+            ticks.add_submap(each, digest_of(encoded(each)))
         if k in watermarks:
             ticks.fold_until(each.stamp_ns)
+    if late is not None:
+        ticks.fold_until(messages[late].stamp_ns - 1)
+        ticks.add_submap(messages[late], digest_of(encoded(messages[late])))
     ticks.fold_until(float("inf"))
     return ticks
 
@@ -145,14 +154,7 @@ def test_late_submaps_give_the_same_bytes(world, ticks):
     messages, _ = world
     wanted = bits(ticks[0].fold)
     assert bits(folded(messages, watermarks=range(0, 72, 9)).fold) == wanted
-    ticks = TickFold(CONFIG, SMALL)
-    held = messages[30]
-    for each in [*messages[:30], *messages[31:]]:
-        ticks.add_submap(each, digest_of(encoded(each)))
-    ticks.fold_until(held.stamp_ns - 1)
-    ticks.add_submap(held, digest_of(encoded(held)))
-    ticks.fold_until(float("inf"))
-    assert bits(ticks.fold) == wanted
+    assert bits(folded(messages, late=30).fold) == wanted
 
 
 def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_same_bytes(
@@ -168,13 +170,7 @@ def test_landmarks_that_nothing_confirms_are_given_up_and_every_order_gives_the_
     assert len({truth[of.first.name] for of in confirmed.values()}) == 16
     assert fold.landmarks.present.keys() == fold.main.graph.landmarks.keys()
     assert len(fold.landmarks.sets) == 16 + false[1]
-    late = TickFold(CONFIG, SMALL)
-    for each in [*messages[:50], *messages[51:]]:
-        late.add_submap(each, digest_of(encoded(each)))
-    late.fold_until(messages[50].stamp_ns - 1)
-    late.add_submap(messages[50], digest_of(encoded(messages[50])))
-    late.fold_until(float("inf"))
-    assert bits(late.fold) == bits(fold)
+    assert bits(folded(messages, late=50).fold) == bits(fold)
 
 
 def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
@@ -189,8 +185,7 @@ def test_what_was_given_up_is_there_when_all_is_linearised_again(all_said):
 @pytest.mark.parametrize("bounded", [True, False])
 def test_the_first_unnamed_landmarks_meet_all_named_ones(bounded):
     rng = np.random.default_rng(7)
-    angle = 2.0 * np.pi * (np.arange(16) + 0.6 * rng.uniform(size=16)) / 16
-    landmarks = 20.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    landmarks = uneven_ring(rng, 20.0)
     path = circle((0.0, 0.0), 17.0, 72, 2.0)
     named, _ = drive("r1", path[:37], landmarks, rng, reach=9.0, named=True)
     unnamed, _ = drive("r1", path[36:], landmarks, rng, reach=9.0)

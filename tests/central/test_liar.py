@@ -1,15 +1,18 @@
 import math
 from collections.abc import Collection, Iterator
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import msgspec
 import numpy as np
 import pytest
 
-from teamslam.central import withdrawal
+from teamslam.central import tick_fold, withdrawal
+from teamslam.central.desk.verification.verification import verify
 from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.submap_fold import SubmapFold
-from teamslam.central.withdrawal import Trial, hold_trial
+from teamslam.central.withdrawal import Trial, disagreement, hold_trial
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.simulator import simulate
@@ -24,6 +27,9 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from tests.central.test_withdrawal import messages, of_set, scenario, team_run
+from tests.scenarios import scenario_in
+from tests.sim.reruns import team_samples, written
+from tests.trials.stress_world import StressWorld, write
 
 LIES = ("still", "micrometre", "far", "modest", "swap")
 """It never moved; its landmarks lie 2 m off, or 100 km, with sigmas of 1 µm; 1 m off with 5 cm;
@@ -71,16 +77,12 @@ class Liar(RobotNode):
     def _spoilt(self, out: list[Outgoing]) -> Iterator[Outgoing]:
         for each in out:
             said = each.message
-            if isinstance(said, m.SightingFactor):
-                if said.sequence < BEFORE:
-                    yield each
-            elif isinstance(said, m.Submap):
-                if self._base is None or said.sequence < BEFORE:
-                    self._base = said
-                    yield each
-                else:
-                    yield each._replace(message=lie(said, self._base, self.kind))
-            else:
+            is_late = getattr(said, "sequence", 0) >= BEFORE
+            if isinstance(said, m.Submap) and is_late:
+                assert self._base is not None
+                yield each._replace(message=lie(said, self._base, self.kind))
+            elif not (isinstance(said, m.SightingFactor) and is_late):
+                self._base = said if isinstance(said, m.Submap) else self._base
                 yield each
 
 
@@ -98,7 +100,7 @@ def run_with(liar: str, kind: str) -> tuple[Sample, ...]:
     return tuple(run_team(of, simulate(of.world, of.robots, of.seed), robot))
 
 
-def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
+def online_errors(samples: tuple[Sample, ...], *robots: str) -> np.ndarray:
     true: dict[tuple[str, int], np.ndarray] = {}
     for each in messages(samples, m.Truth):
         poses = floats(each.poses, "poses").reshape(-1, 3)
@@ -107,11 +109,10 @@ def online_errors(samples: tuple[Sample, ...], liar: str) -> np.ndarray:
             for stamp, pose in zip(stamps(each.stamps, "stamps").tolist(), poses, strict=True)
         }
     found = []
-    for channel, _, each in map(opened, samples):
-        if channel is ch.TEAM_POSE and each.robot != liar:
-            at = true.get((each.robot, each.stamp_ns))
-            if at is not None:
-                found.append(np.hypot(*(floats(each.pose, "pose") - at)[:2]))
+    for channel, robot, each in map(opened, samples):
+        at = true.get((robot, each.stamp_ns))
+        if channel is ch.TEAM_POSE and robot in robots and each.in_team_frame and at is not None:
+            found.append(np.hypot(*(floats(each.pose, "pose") - at)[:2]))
     return np.array(found)
 
 
@@ -126,9 +127,10 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
     found = landmark_map(solve_fold(never.fold, never.settings))
     assert final.means == found.means.tobytes()
     assert final.covariance == translate.joint_bytes(found.covariance)
-    errors = online_errors(samples, liar)
+    others = {"r1", "r2", "r3"} - {liar}
+    errors = online_errors(samples, *others)
     assert len(errors) > 20
-    assert errors.max() < online_errors(run_with("", ""), liar).max() + 1.0
+    assert errors.max() < online_errors(run_with("", ""), *others).max() + 1.0
 
 
 def test_a_robot_with_few_submaps_is_suspended_and_tested_again():
@@ -215,12 +217,9 @@ def test_a_liar_ahead_of_the_watermark_is_not_in_the_provisional_map():
     """All submaps are there, but only the first tick and a half is closed."""
     samples = run_with("r1", "still")
     rule = MapPublisher(SubmapFold(scenario().central, bytes(8)))
-    for start in messages(samples, m.InitialPose):
-        rule.store.add_start(start)
-    for sighting in messages(samples, m.SightingFactor):
-        rule.store.add_sighting(sighting)
-    for submap in messages(samples, m.Submap):
-        rule.store.add_submap(submap)
+    for kind in (m.InitialPose, m.SightingFactor, m.Submap):
+        for message in messages(samples, kind):
+            rule.store.add(message)
     out = rule.publish_due(15e9, 10**11)
     (fused,) = (each.message for each in out if isinstance(each.message, m.FusedMap))
     assert fused.provisional
@@ -267,3 +266,73 @@ def test_a_submap_that_claims_less_than_the_least_spread_is_raised_and_its_robot
     true = of_set(team_run())
     true.fold_until(math.inf)
     assert dict(true.inputs.raised(true.withdrawn)) == {}
+
+
+# Robots apart from the others.
+
+
+@cache
+def mirrored_run(robot: str) -> tuple[Sample, ...]:
+    with TemporaryDirectory() as place:
+        world = StressWorld(seed=3, seconds=60.0, mirrored=(robot,) if robot else ())
+        return tuple(team_samples(scenario_in(write(world, Path(place)))))
+
+
+@pytest.mark.parametrize("wrong", ["r1", "r2", "r3"])
+def test_nobodys_pose_is_harmed_by_a_mirrored_robot(wrong):
+    """Its first submaps do not show it yet. r1 fixes the frame."""
+    samples = mirrored_run(wrong)
+    assert final_map(list(samples)).withdrawn == (wrong,)
+    for robot in {"r1", "r2", "r3"} - {wrong}:
+        errors = online_errors(samples, robot)
+        assert len(errors) > 50
+        assert errors.max() < online_errors(mirrored_run(""), robot).max() + 1.0
+
+
+def test_robots_that_agree_are_in_each_others_priors_and_those_that_contradict_are_not():
+    for robot, apart in (("", False), ("r2", True)):
+        samples = mirrored_run(robot)
+        ticks = of_set(samples)
+        ticks.fold_until(10e9)
+        folds = ticks.fold_apart(ticks.fold, ahead=False)
+        assert bool(folds) == apart
+        for name, fold in folds.items():
+            assert {each.robot for each in fold.contributions} == {name}
+
+
+def test_too_small_covariances_by_themselves_are_no_contradiction():
+    ticks = of_set(team_run())
+    for each in messages(team_run(), m.Submap):
+        covariance = floats(each.covariance, "covariance") / 25.0
+        ticks.add_submap(
+            msgspec.structs.replace(each, covariance=covariance.tobytes(), sightings=0), bytes(8)
+        )
+    ticks.convicts = False
+    ticks.fold_until(math.inf)
+    assert min(disagreement(ticks.agreement(ticks.fold)).values()) > 8.0
+    assert ticks.fold_apart(ticks.fold, ahead=False) == {}
+
+
+def test_priors_of_robots_apart_are_recomputed_from_the_log(tmp_path):
+    result = verify(written(tmp_path / "log.mcap", mirrored_run("r2")))
+    assert result.first is None, str(result.first)
+    assert {c.channel for c in result.channels if c.equal} >= {"prior", "final_map"}
+
+
+def test_a_trial_continues_the_folds_of_earlier_ones(monkeypatch):
+    """Folded ticks: at most those of the nominal run for each robot left out, each robot alone,
+    and a restart with each of the few suspensions.
+    """
+    counts = []
+    for robot in ("", "r2"):
+        samples, ticks = mirrored_run(robot), []
+        fold = tick_fold.fold_tick
+        monkeypatch.setattr(
+            tick_fold, "fold_tick", lambda *given, f=fold, n=ticks: n.append(1) or f(*given)
+        )
+        final = of_set(samples)
+        final.fold_until(60e9)
+        final.fold_apart(final.fold, ahead=False)
+        counts.append(len(ticks))
+        monkeypatch.undo()
+    assert counts[1] <= 12 * counts[0]

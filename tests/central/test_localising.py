@@ -5,7 +5,6 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central.desk.names import not_joined
 from teamslam.central.desk.verification.centre import recompute_centre
@@ -13,7 +12,6 @@ from teamslam.central.desk.verification.recorded import Recorded, identity
 from teamslam.central.desk.verification.robot import recompute_robot
 from teamslam.central.localising import restricted
 from teamslam.central.saved_maps import NothingToSaveError
-from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -23,20 +21,26 @@ from teamslam.team.saved_map import write_map
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_ids, ids
-from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
-from tests.central.test_saved_map import day, elsewhere, first_day, part, with_means
+from tests.central.test_saved_map import day, elsewhere, first_day, numbers, part, with_means
+from tests.central.test_withdrawal import messages
+from tests.commands import output_of
+from tests.scenarios import selected
 from tests.trials.day_two import judge, simulated, summary
 
 SECOND_NS = 1_000_000_000
 
 
+def beginning(scenario, length_s=60):
+    whole = streams_of(scenario)
+    first_ns = min(first for first, _ in whole.spans_ns.values())
+    return part(whole, first_ns, first_ns + length_s * SECOND_NS, begins=False)
+
+
 @cache
 def short_day(*, localise=False, wrong=None, length_s=60):
     scenario = with_options(load("thesis-b"), seed=1001, localise=localise)
-    whole = streams_of(scenario)
-    first_ns = min(first for first, _ in whole.spans_ns.values())
-    streams = part(whole, first_ns, first_ns + length_s * SECOND_NS, begins=False)
+    streams = beginning(scenario, length_s)
     saved = first_day()[1] if wrong is None else with_means(wrong)
     return day(0, [saved], scenario=scenario, streams=streams)
 
@@ -50,14 +54,10 @@ def test_robots_without_a_start_are_placed_within_seconds_as_surely_as_stated():
     assert found["within_two_sigma"] >= 0.8
 
 
-def messages_of(samples, kind):
-    return [each for each in (opened(sample)[2] for sample in samples) if isinstance(each, kind)]
-
-
 def test_a_prior_of_landmarks_alone_comes_first_and_then_one_with_a_pose():
     samples, _, _ = short_day()
     for robot in ("r1", "r2"):
-        priors = [each for each in messages_of(samples, m.Prior) if each.robot == robot]
+        priors = [each for each in messages(samples, m.Prior) if each.robot == robot]
         first, *later = priors
         assert not first.in_team_frame
         assert first.frame == "map-site/0"
@@ -68,7 +68,7 @@ def test_a_prior_of_landmarks_alone_comes_first_and_then_one_with_a_pose():
 
 def test_a_map_of_another_site_places_no_robot():
     samples, _, _ = short_day(wrong=elsewhere)
-    poses = messages_of(samples, m.PoseEstimate)
+    poses = messages(samples, m.PoseEstimate)
     assert poses
     assert not [each for each in poses if each.in_team_frame and each.frame.startswith("map-")]
 
@@ -92,31 +92,27 @@ def test_the_maps_priors_and_poses_are_computed_again_from_the_log(localise):
 def test_localising_leaves_the_map_as_it_was_saved():
     samples, centre, _ = short_day(localise=True)
     saved, fused = first_day()[1], final_map(samples)
-    assert (fused.ids, fused.means, fused.covariance) == (
-        saved.ids,
-        saved.means,
-        saved.covariance,
-    )
+    assert numbers(fused) == numbers(saved)
     assert fused.frame == "map-site/0"
-    for each in messages_of(samples, m.FusedMap):
+    for each in messages(samples, m.FusedMap):
         assert (each.ids, each.means) == (saved.ids, saved.means)
-    assert {each.robot for each in messages_of(samples, m.Trajectory)} == {"r1", "r2"}
+    assert {each.robot for each in messages(samples, m.Trajectory)} == {"r1", "r2"}
     with pytest.raises(NothingToSaveError):
         centre.maps.fold.save_map("later")
 
 
 def test_a_landmark_that_the_map_lacks_is_left_out_of_submaps():
     saved = first_day()[1]
-    submap = messages_of(short_day()[0], m.Submap)[0]
-    numbers = ids(submap.ids, "ids")
+    submap = messages(short_day()[0], m.Submap)[0]
+    own = ids(submap.ids, "ids")
     few = ids(saved.ids, "ids")
     assert restricted(submap, [saved]) is submap
-    without = msgspec.structs.replace(saved, ids=from_ids(few[few != numbers[0]]))
+    without = msgspec.structs.replace(saved, ids=from_ids(few[few != own[0]]))
     taken = restricted(submap, [without])
     taken.check()
-    assert ids(taken.ids, "ids").tolist() == numbers[1:].tolist()
+    assert ids(taken.ids, "ids").tolist() == own[1:].tolist()
     whole, marginal = (translate.local_map_of(each) for each in (submap, taken))
-    keep = np.delete(np.arange(len(whole.mean)), np.arange(2) + len(whole.mean) - 2 * len(numbers))
+    keep = np.delete(np.arange(len(whole.mean)), np.arange(2) + len(whole.mean) - 2 * len(own))
     assert (marginal.mean == whole.mean[keep]).all()
     assert (marginal.covariance == whole.covariance[np.ix_(keep, keep)]).all()
     assert np.allclose(marginal.sensitivity, whole.sensitivity[:, keep], rtol=1e-6)
@@ -125,7 +121,7 @@ def test_a_landmark_that_the_map_lacks_is_left_out_of_submaps():
 
 def test_localising_in_the_map_of_another_site_gives_no_path_and_the_same_map():
     samples, _, _ = short_day(localise=True, wrong=elsewhere)
-    assert not messages_of(samples, m.Trajectory)
+    assert not messages(samples, m.Trajectory)
     assert final_map(samples).means == with_means(elsewhere).means
 
 
@@ -136,8 +132,8 @@ def reflected(points):
 @pytest.mark.parametrize("wrong", [reflected, elsewhere])
 def test_a_wrong_map_is_named_with_the_remedy_and_no_robot_is_said_to_be_mirrored(wrong):
     samples, _, _ = short_day(localise=True, wrong=wrong, length_s=100)
-    maps = [*messages_of(samples, m.FusedMap)]
-    assert not [each for of in maps for each in of.diagnosis if each.cause == "mirrored"]
+    causes = [each.cause for of in messages(samples, m.FusedMap) for each in of.diagnosis]
+    assert "mirrored" not in causes
     apart = dict(not_joined(final_map(samples).reasons))
     assert set(", ".join(apart).split(", ")) == {"r1", "r2"}
     assert not final_map(samples).joined
@@ -151,16 +147,12 @@ def test_the_command_localises_a_log_again(tmp_path):
     with Recorder(log, "small", {"seed": "1"}) as recorder:
         recorder.write(short_day()[0])
     write_map(site, first_day()[1])
-    run = CliRunner().invoke
-    made = run(app, ["localise", "--map", str(site), str(log), "--json", str(result)])
-    assert made.exit_code == 0, made.output
-    assert "final map: the saved one, with poses and paths in its frame" in made.output
+    made = output_of("localise", "--map", site, log, "--json", result)
+    assert "final map: the saved one, with poses and paths in its frame" in made
     figures = json.loads(result.read_text())["recomputed"]
     assert figures["landmarks"] == 18
     assert {each["state"] for each in figures["changes"]} <= {"unchanged"}
-    without = run(app, ["launch", "thesis-b", "--localise"])
-    assert without.exit_code == 2
-    assert "one saved map" in without.output
+    assert "one saved map" in output_of("launch", "thesis-b", "--localise", status=2)
 
 
 def without(world, robot, until_ns):
@@ -176,12 +168,11 @@ def without(world, robot, until_ns):
 def test_a_robot_is_placed_by_the_saved_map_while_another_has_seen_nothing():
     """The one that has seen nothing is the team's map, for want of a start."""
     scenario = with_options(load("thesis-b"), seed=1001)
-    whole = streams_of(scenario)
-    first_ns = min(first for first, _ in whole.spans_ns.values())
-    streams = part(whole, first_ns, first_ns + 60 * SECOND_NS, begins=False)
+    streams = beginning(scenario)
+    first_ns = min(first for first, _ in streams.spans_ns.values())
     streams = without(without(streams, "r1", 2**62), "r2", first_ns + 30 * SECOND_NS)
     samples, _, _ = day(0, [first_day()[1]], scenario=scenario, streams=streams)
-    of_r2 = [each for each in messages_of(samples, m.Prior) if each.robot == "r2"]
+    of_r2 = [each for each in messages(samples, m.Prior) if each.robot == "r2"]
     assert {each.frame for each in of_r2} == {"map-site/0"}
     assert {len(ids(each.ids, "ids")) for each in of_r2} == {18}
 
@@ -190,17 +181,8 @@ def of_first_landmarks(world, count):
     streams = []
     for each in world.streams:
         seen = each.landmark_detections
-        message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
         known = list(dict.fromkeys(seen.ids.tolist()))[:count]
-        chosen = np.isin(seen.ids, known)
-        counts = np.bincount(message[chosen], minlength=len(seen.stamps_ns))
-        own = dataclasses.replace(
-            seen,
-            offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            ids=seen.ids[chosen],
-            ranges=seen.ranges[chosen],
-            bearings=seen.bearings[chosen],
-        )
+        own = selected(seen, np.isin(seen.ids, known))
         streams.append(dataclasses.replace(each, landmark_detections=own))
     return dataclasses.replace(world, streams=tuple(streams))
 

@@ -9,9 +9,11 @@ from teamslam.central.map_publisher import MapPublisher
 from teamslam.central.sent_priors import SentPriors
 from teamslam.central.submap_fold import SubmapFold
 from teamslam.team import translate
+from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.map_joining.marginals import LandmarkBlocks
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import from_ids, ids
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.teams import Submaps, of, published, stream
@@ -30,11 +32,14 @@ def rule(config=CONFIG, starts=("r1", "r2")):
     return found
 
 
-def whole(config=CONFIG):
-    found = rule(config)
+def with_all(found):
     for submap in SUBMAPS.every():
         found.store.add_submap(submap)
     return found
+
+
+def whole(config=CONFIG):
+    return with_all(rule(config))
 
 
 def final(found):
@@ -73,10 +78,8 @@ def test_a_map_has_what_the_watermark_has_passed_though_its_tick_is_not_whole():
             maps += said
     assert [each.members for each in maps] == [build.version(r1=k, r2=k) for k in range(3)]
     assert not any(each.provisional for each in maps)
-    for submap in SUBMAPS.every():
-        found.store.add_submap(submap)
     config = CentralConfig(tick_s=100.0, broadcast_s=3.0)
-    assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
+    assert encoded(final(with_all(found))) == encoded(final(whole(config))), "it leaves no trace"
 
 
 def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
@@ -89,9 +92,7 @@ def test_a_map_that_is_asked_for_waits_for_no_teammate_and_is_said_once():
     maps = [of(out, ch.FUSED_MAP)[0] for out in said]
     assert [sum(each.sequence + 1 for each in fused.members) for fused in maps] == [1, 2, 3]
     assert all(fused.provisional for fused in maps)
-    for submap in SUBMAPS.every():
-        found.store.add_submap(submap)
-    assert encoded(final(found)) == encoded(final(whole(config))), "it leaves no trace"
+    assert encoded(final(with_all(found))) == encoded(final(whole(config))), "it leaves no trace"
 
 
 def test_no_map_has_less_than_the_one_before_it():
@@ -130,13 +131,7 @@ def test_when_a_robot_stalls_there_is_a_provisional_map_also_without_a_closed_on
     assert fused.members == build.version(r1=4)
     assert found.publish_due(float("-inf"), late_ns + 1) == []
     assert found.publish_due(float("-inf"), 10 * late_ns) == [], "there is nothing new to say"
-    assert encoded(final(_completed(found))) == encoded(final(whole())), "it leaves no trace"
-
-
-def _completed(found):
-    for submap in SUBMAPS["r2"]:
-        found.store.add_submap(submap)
-    return found
+    assert encoded(final(with_all(found))) == encoded(final(whole())), "it leaves no trace"
 
 
 def sequences(found, robot):
@@ -213,12 +208,73 @@ def test_a_withdrawal_that_is_revoked_and_decided_again_is_announced_twice(monke
     for reason in ({"r2": "it slips"}, {"r2": "it slips"}, {}, {"r2": "it slips again"}):
         convicted.clear()
         convicted.update(reason)
-        said.append(
-            [(each.robot, each.reason) for each in of(found.publish_final(0), ch.WITHDRAWAL)]
-        )
+        told = of(found.publish_final(0), ch.WITHDRAWAL)
+        said.append([(each.robot, each.reason) for each in told])
     assert said == [[("r2", "it slips")], [], [], [("r2", "it slips again")]]
     assert found.warnings == [
         "r2 withdrawn by central: it slips",
         "r2 is withdrawn no more: what came late speaks for it",
         "r2 withdrawn by central: it slips again",
     ]
+
+
+# Landmarks that too few submaps have.
+
+
+FALSE = 9  # the name of a landmark that is not there
+
+
+def misread(submap, name=FALSE, **fields):
+    seen = [*ids(submap.ids, "ids")[:-1], name]
+    return msgspec.structs.replace(submap, ids=from_ids(seen), **fields)
+
+
+def spoilt(*names, **options):
+    """A rule that has all submaps; these have a misread landmark."""
+    found = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0, **options))
+    for name, submaps in SUBMAPS.items():
+        for k, submap in enumerate(submaps):
+            found.store.add_submap(misread(submap) if (name, k) in names else submap)
+    return found
+
+
+def left_out(fused):
+    return [text for text in fused.reasons if "left out" in text]
+
+
+@pytest.mark.parametrize(("least", "stands"), [(1, True), (2, False)])
+def test_what_one_submap_alone_has_stands_in_the_map_only_if_one_is_enough(least, stands):
+    fused = final(spoilt(("r1", 3), landmark_submaps=least))
+    assert (FALSE in ids(fused.ids, "ids")) == stands
+    assert len(left_out(fused)) == (not stands)
+    assert all(f"of 6 landmarks ({FALSE})" in text for text in left_out(fused))
+
+
+def test_what_two_submaps_agree_on_enters_the_map_with_both():
+    fused = final(spoilt(("r1", 3), ("r2", 3), landmark_submaps=2))
+    assert FALSE in ids(fused.ids, "ids")
+    assert left_out(fused) == []
+
+
+def test_running_maps_and_priors_have_the_same_landmarks():
+    found = spoilt(("r1", 3), landmark_submaps=2)
+    out = found.publish_due(END_NS, END_NS)
+    (fused,) = of(out, ch.FUSED_MAP)
+    shown = ids(fused.ids, "ids").tolist()
+    assert shown
+    assert FALSE not in shown
+    priors = of(out, ch.PRIOR)
+    assert len(priors) == 2
+    assert all(ids(each.ids, "ids").tolist() == shown for each in priors)
+
+
+def test_what_one_submap_has_without_a_name_is_in_running_maps_and_not_in_the_final_one():
+    found = rule(CentralConfig(tick_s=3.0, broadcast_s=3.0), ["r1"])
+    for k, submap in enumerate(SUBMAPS["r1"]):
+        seen_twice = {"counts": from_ids([2]), "seen": b"\1", "keyframes": 1}
+        found.store.add_submap(misread(submap, UNNAMED, **seen_twice) if k == 2 else submap)
+    (running,) = of(found.publish_due(END_NS, END_NS), ch.FUSED_MAP)
+    last = final(found)
+    tentative, kept = (int(ids(each.ids, "ids")[-1]) for each in (running, last))
+    assert tentative >= UNNAMED > kept
+    assert [text.startswith("left out, 2 submaps") for text in left_out(last)] == [True]

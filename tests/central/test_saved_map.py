@@ -5,16 +5,15 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from teamslam.central import saved_maps
+from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.verification.centre import recorded_map
 from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.central.saved_maps import NothingToSaveError, save_map
 from teamslam.central.withdrawal import Trial
-from teamslam.sim.cli.main import app
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import ScenarioError, load, with_options
 from teamslam.sim.scenarios.source import streams_of
@@ -33,6 +32,7 @@ from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.air import Air
 from tests.bits import SETS
+from tests.commands import output_of, run
 from tests.peer_team import PeerTeam, peer_world
 from tests.scenarios import final_only, scenario_in, with_world
 from tests.support import example
@@ -41,14 +41,18 @@ from tests.trials.stress_world import MovedLandmark, StressWorld, write
 ALL = ("*",)
 
 
+def displaced(scenario, moved):
+    places = np.array(scenario.world.landmarks)
+    for number, by in moved:
+        places[number - 1] += by
+    return tuple(map(tuple, places.tolist()))
+
+
 def day(seed, maps=(), *, moved=(), unknown=(), scenario="thesis-b", streams=None):
     day_of = msgspec.structs.replace(load(scenario), seed=seed) if streams is None else scenario
     if streams is None:
-        day_of = final_only(day_of)
-        places = [list(each) for each in day_of.world.landmarks]
-        for number, (dx, dy) in dict(moved).items():
-            places[number - 1] = [places[number - 1][0] + dx, places[number - 1][1] + dy]
-        day_of = with_world(day_of, landmarks=tuple(map(tuple, places)), unknown_starts=unknown)
+        landmarks = displaced(day_of, moved)
+        day_of = final_only(with_world(day_of, landmarks=landmarks, unknown_starts=unknown))
         streams = streams_of(day_of)
     centres = []
 
@@ -71,16 +75,20 @@ def second_day(loaded=True, moved=(), unknown=()):
     return day(1001, maps, moved=moved, unknown=unknown)
 
 
+def covariance_of(saved: m.FusedMap | m.SavedMap) -> np.ndarray:
+    return unpacked(floats(saved.covariance, "covariance"), 2 * len(ids(saved.ids, "ids")))
+
+
 def errors(fused: m.FusedMap, streams: WorldStreams):
     found = ids(fused.ids, "ids")
     truth = streams.landmarks[np.searchsorted(streams.landmark_ids, found)]
-    n = 2 * len(found)
-    P = unpacked(floats(fused.covariance, "covariance"), n)
-    means = floats(fused.means, "means").reshape(-1, 2)
-    fit = align(Maps(truth, 1e-12 * np.eye(n), means, P))
-    x, y, turn = procrustes(truth, means, np.ones(len(found)))
-    s, c = np.sin(turn), np.cos(turn)
-    off = truth - means @ np.array([[c, s], [-s, c]]) - [x, y]
+    return aligned_errors(truth, floats(fused.means, "means").reshape(-1, 2), covariance_of(fused))
+
+
+def aligned_errors(truth: np.ndarray, means: np.ndarray, P: np.ndarray) -> tuple[float, float]:
+    """RMSE [m] and NEES per degree of freedom after alignment."""
+    fit = align(Maps(truth, 1e-12 * np.eye(len(P)), means, P))
+    off = truth - transform_points(procrustes(truth, means, np.ones(len(truth))), means)
     return float(np.sqrt((off**2).sum(axis=1).mean())), fit.chi2 / fit.dof
 
 
@@ -131,13 +139,16 @@ def test_a_day_that_the_map_contains_fails_and_gives_no_advice_about_sigmas(tmp_
     assert "already" not in "; ".join(second_day()[1].findings)
     if localise:
         return
-    log = tmp_path / "log.mcap"
-    with Recorder(log, "small", {"seed": "1"}) as recorder:
-        recorder.write(samples)
-    save = CliRunner().invoke(app, ["map", "save", str(log), "-o", str(tmp_path / "twice.map")])
-    assert save.exit_code == 1
-    assert "r1's measurements of this day are in the saved map site already" in save.output
+    log = recorded(tmp_path / "log.mcap", samples)
+    save = output_of("map", "save", log, "-o", tmp_path / "twice.map", status=1)
+    assert "r1's measurements of this day are in the saved map site already" in save
     assert not (tmp_path / "twice.map").exists()
+
+
+def recorded(path, samples):
+    with Recorder(path, "small", {"seed": "1"}) as recorder:
+        recorder.write(samples)
+    return path
 
 
 @pytest.mark.parametrize("moved", [((15, (0.5, 0.0)),), tuple((k, (3.0, 2.0)) for k in (2, 8, 11))])
@@ -208,10 +219,7 @@ def test_a_running_centre_saves_the_map_of_its_present_set():
     assert whole == first_day()[1]
     assert early.sets == whole.sets
     assert len(whole.sets) == len(robots)
-    assert (
-        np.diag(unpacked(floats(early.covariance, "covariance"), 36)).sum()
-        > np.diag(unpacked(floats(whole.covariance, "covariance"), 36)).sum()
-    )
+    assert np.trace(covariance_of(early)) > np.trace(covariance_of(whole))
 
 
 def test_two_saves_of_a_day_count_once_though_an_earlier_robot_came_between():
@@ -239,10 +247,8 @@ def test_a_change_that_chance_may_explain_leaves_todays_place_uncertain_by_it():
 
     def covariance(chi2):
         moved = m.LandmarkChange(landmark=15, state="moved", dx=by[0], dy=by[1], chi2=chi2)
-        saved = save_map(
-            fold, msgspec.structs.replace(fused, changes=(moved,)), "later", {}, [bytes(8)]
-        )
-        return unpacked(floats(saved.covariance, "covariance"), 2 * len(ids(saved.ids, "ids")))
+        with_move = msgspec.structs.replace(fused, changes=(moved,))
+        return covariance_of(save_map(fold, with_move, "later", {}, [bytes(8)]))
 
     more = covariance(20.0) - covariance(40.0)
     at = 2 * ids(fused.ids, "ids").tolist().index(15)
@@ -256,11 +262,7 @@ def test_more_days_do_not_make_the_scale_of_a_map_certain(monkeypatch):
     fold = second_day()[1].maps.fold
     saved = fold.save_map("later")
     monkeypatch.setattr(saved_maps, "SCALE", 0.0)
-    n = 2 * len(ids(saved.ids, "ids"))
-    more, less = (
-        unpacked(floats(each.covariance, "covariance"), n)
-        for each in (saved, fold.save_map("later"))
-    )
+    more, less = covariance_of(saved), covariance_of(fold.save_map("later"))
     points = floats(saved.means, "means").reshape(-1, 2)
     away = 3e-4 * (points - points.mean(axis=0)).ravel()
     assert np.allclose(more - less, np.outer(away, away), atol=1e-12)
@@ -300,13 +302,11 @@ def test_running_maps_await_the_final_one_where_a_landmark_of_a_saved_map_has_tw
     fold = day(1001, [first_day()[1]])[1].maps.fold
 
     def explain(island):
-        places = (
-            hypotheses.Hypothesis(
-                "identity_shared", id_, frozenset({"r1"}), 0, (0.5, 0.0), (0.01,), 99.0, 2, island
-            )
+        robots, figures = frozenset({"r1"}), (0, (0.5, 0.0), (0.01,), 99.0, 2)
+        return [
+            hypotheses.Hypothesis("identity_shared", id_, robots, *figures, island)
             for id_ in (4, 1000)
-        )
-        return list(places), island
+        ], island
 
     monkeypatch.setattr(hypotheses, "explain", explain)
 
@@ -334,13 +334,9 @@ def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
     samples, _, _ = second_day()
     _, centre, _ = second_day(loaded=False)
     fold = type(centre.maps.fold)(centre.config, centre.config_digest)
-    recorded = Recorded()
-    recorded.take_all(samples)
-    for messages in recorded.measurements.values():
-        fold.store.add(messages[0])
-    for submaps in recorded.submaps().values():
-        for sequence in sorted(submaps):
-            fold.store.add(submaps[sequence])
+    for message in (opened(each)[2] for each in samples):
+        if isinstance(message, m.InitialPose | m.Submap):
+            fold.store.add(message)
     fold.store.add(first_day()[1])
     joined = fold.make_map("final")[-1].message
     assert numbers(joined) == numbers(final_map(samples))
@@ -353,9 +349,9 @@ def test_a_withdrawn_map_leaves_the_bytes_of_a_day_without_it():
 
 def test_the_saved_map_of_a_log_is_that_of_its_centre():
     samples, centre, _ = second_day()
-    recorded = Recorded()
-    recorded.take_all(samples)
-    assert recorded_map(recorded, "both") == centre.maps.fold.save_map("both")
+    log = Recorded()
+    log.take_all(samples)
+    assert recorded_map(log, "both") == centre.maps.fold.save_map("both")
 
 
 def test_a_chain_of_days_stays_one_map_of_the_same_size_and_consistent():
@@ -411,10 +407,7 @@ def test_the_file_is_read_as_written_and_a_wrong_one_is_named_with_the_remedy(tm
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        (
-            {"covariance": from_floats([1.0, 0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0])},
-            "positive",
-        ),
+        ({"covariance": from_floats([1, 0, 0, 2, 1, 0, 0, 1, 0, 1])}, "positive"),
         ({"means": from_floats([1.0, np.nan, 0.0, 0.0])}, "finite"),
         ({"sensitivity": b""}, "length"),
         ({"counts": bytes(8)}, "length"),
@@ -429,9 +422,8 @@ def test_the_door_refuses_an_unsound_map(fields, words):
 
 def test_two_maps_with_a_day_in_common_would_count_it_twice():
     saved = first_day()[1]
-    later = msgspec.structs.replace(
-        saved, name="later", sets=tuple(sorted((*saved.sets, b"8 bytes!")))
-    )
+    sets = tuple(sorted((*saved.sets, b"8 bytes!")))
+    later = msgspec.structs.replace(saved, name="later", sets=sets)
     store = SubmapStore()
     assert store.add(saved) is None
     assert store.add(saved) is None
@@ -442,8 +434,7 @@ def test_two_maps_with_a_day_in_common_would_count_it_twice():
 
 
 def classed(seed, classes):
-    day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
-    world = streams_of(final_only(day_of))
+    day_of, world = hidden(seed)
     streams = []
     for each in world.streams:
         seen = each.landmark_detections
@@ -451,7 +442,7 @@ def classed(seed, classes):
         rows[np.arange(len(rows)), classes(seen.ids)] = np.log(0.8)
         own = dataclasses.replace(seen, classes=rows)
         streams.append(dataclasses.replace(each, landmark_detections=own))
-    return final_only(day_of), dataclasses.replace(world, streams=tuple(streams))
+    return day_of, dataclasses.replace(world, streams=tuple(streams))
 
 
 def test_a_map_without_identities_is_saved_with_classes_which_tell_it_from_another():
@@ -473,10 +464,7 @@ def test_a_map_without_identities_is_saved_with_classes_which_tell_it_from_anoth
 
 def hidden(seed, moved=()):
     day_of = with_options(msgspec.structs.replace(load("thesis-b"), seed=seed), identities="hidden")
-    places = np.array(day_of.world.landmarks)
-    for number, by in moved:
-        places[number - 1] += by
-    day_of = final_only(with_world(day_of, landmarks=tuple(map(tuple, places.tolist()))))
+    day_of = final_only(with_world(day_of, landmarks=displaced(day_of, moved)))
     return day_of, streams_of(day_of)
 
 
@@ -543,43 +531,34 @@ def test_a_landmark_that_association_takes_for_another_within_the_gate_has_moved
 
 
 def test_the_commands_save_show_and_load_a_map(tmp_path):
-    log, later, site = (tmp_path / name for name in ("log.mcap", "later.mcap", "site.map"))
-    for path, samples in ((log, first_day()[0]), (later, second_day(loaded=False)[0])):
-        with Recorder(path, "small", {"seed": "1"}) as recorder:
-            recorder.write(samples)
-    run = CliRunner().invoke
-    made = run(app, ["map", "save", str(log), "-o", str(site)])
-    assert made.exit_code == 0, made.output
+    log = recorded(tmp_path / "log.mcap", first_day()[0])
+    later = recorded(tmp_path / "later.mcap", second_day(loaded=False)[0])
+    site, result = tmp_path / "site.map", tmp_path / "x.json"
+    output_of("map", "save", log, "-o", site)
     assert read_map(site) == first_day()[1]
-    shown = run(app, ["map", "show", str(site), "--json", str(tmp_path / "site.json")])
-    assert shown.exit_code == 0
-    assert "landmark,x,y,sigma_x,sigma_y,submaps" in shown.output
-    assert len(json.loads((tmp_path / "site.json").read_text())["landmarks"]) == 18
-    again = run(app, ["rerun", str(later), "--map", str(site), "--json", str(tmp_path / "x.json")])
-    assert again.exit_code == 0, again.output
-    changes = json.loads((tmp_path / "x.json").read_text())["recomputed"]["changes"]
+    shown = output_of("map", "show", site, "--json", result)
+    assert "landmark,x,y,sigma_x,sigma_y,submaps" in shown
+    assert len(json.loads(result.read_text())["landmarks"]) == 18
+    rerun = ("rerun", later, "--map", site, "--json", result)
+    output_of(*rerun)
+    changes = json.loads(result.read_text())["recomputed"]["changes"]
     assert [each["state"] for each in changes] == ["unchanged"] * 18
     assert {"landmark", "state", "dx_m", "dy_m", "sigma_m", "chi2"} <= changes[0].keys()
-    for changed in ([], ["--window", "8"]):
-        twice = run(app, ["rerun", str(log), "--map", str(site), *changed])
+    for options in ([], ["--window", "8"]):
+        twice = run("rerun", log, "--map", site, *options)
         assert isinstance(twice.exception, ScenarioError)  # status 2 of the program
         assert "r1's measurements of this day are in the saved map site" in str(twice.exception)
         assert "recorded" not in twice.output
     write_map(site, with_means(elsewhere))
-    wrong = run(app, ["rerun", str(later), "--map", str(site), "--json", str(tmp_path / "x.json")])
-    assert wrong.exit_code == 0, wrong.output
-    (warning,) = json.loads((tmp_path / "x.json").read_text())["recomputed"]["warnings"]
+    wrong = output_of(*rerun)
+    (warning,) = json.loads(result.read_text())["recomputed"]["warnings"]
     assert warning["cause"] == "saved_map_not_joined"
     assert "the saved map site is not in the team's map: 18 shared landmarks" in warning["text"]
     assert warning["text"].endswith("load the right map, or save a new one")
-    assert f"warning: {warning['text']}" in wrong.output
-    for words in (["map", "show", str(log)], ["rerun", str(log), "--map", str(log)]):
-        wrong = run(app, words)
-        assert wrong.exit_code == 2
-        assert "no saved map" in wrong.output
-    named = run(app, ["map", "save", str(log), "-o", str(tmp_path / "A map.map")])
-    assert named.exit_code == 2
-    assert "--name" in named.output
+    assert f"warning: {warning['text']}" in wrong
+    for words in (("map", "show", log), ("rerun", log, "--map", log)):
+        assert "no saved map" in output_of(*words, status=2)
+    assert "--name" in output_of("map", "save", log, "-o", tmp_path / "A map.map", status=2)
 
 
 def part(world: WorldStreams, first_ns: int, last_ns: int, *, begins: bool) -> WorldStreams:
@@ -597,16 +576,10 @@ def part(world: WorldStreams, first_ns: int, last_ns: int, *, begins: bool) -> W
             found.only(*np.searchsorted(found.stamps_ns, [start_ns, last_ns]).tolist())
             for found in (each.landmark_detections, each.teammate_detections)
         ]
-        streams.append(
-            dataclasses.replace(
-                each,
-                start_ns=start_ns,
-                start=each.start if begins else None,
-                intervals=dataclasses.replace(of, **rows),
-                landmark_detections=seen[0],
-                teammate_detections=seen[1],
-            )
-        )
+        own = {"intervals": dataclasses.replace(of, **rows), "start_ns": start_ns}
+        own |= {"landmark_detections": seen[0], "teammate_detections": seen[1]}
+        start = each.start if begins else None
+        streams.append(dataclasses.replace(each, start=start, **own))
     return dataclasses.replace(world, streams=tuple(streams))
 
 

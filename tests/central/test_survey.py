@@ -1,3 +1,4 @@
+import dataclasses
 from functools import cache
 
 import msgspec
@@ -6,17 +7,25 @@ import pytest
 
 from teamslam.central.config import CentralConfig, SurveyedLandmark
 from teamslam.central.desk.evaluation.evaluation import evaluate
+from teamslam.central.desk.export.take_home import take_home
+from teamslam.central.desk.verification.centre import recorded_map
+from teamslam.central.desk.verification.recorded import Recorded
 from teamslam.central.node import CentralNode, make_centre
+from teamslam.central.survey import datum_of
 from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.team.config import SURVEY_FRAME
+from teamslam.team.config import GNSS, SURVEY_FRAME, Bounds, Gnss
 from teamslam.team.core import unpacked
-from teamslam.team.saved_map import SavedMapError, map_name
+from teamslam.team.datum import Datum
+from teamslam.team.estimation.plausibility import sighting_beyond
+from teamslam.team.saved_map import SavedMapError, datum_in, map_figures, map_name
+from teamslam.team.translate import sighting_of
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import opened
-from tests.scenarios import final_only, with_world
+from tests.central.test_withdrawal import messages
+from tests.scenarios import final_only, with_front_ends, with_robots, with_world
 from tests.sim.reruns import check_recomputed
 
 SIGMA_M = 0.05
@@ -25,10 +34,8 @@ UTM = (399_000.0, 5_756_000.0)  # an origin of the survey far from the site, as 
 
 @cache
 def drive(seed, unknown=("*",)):
-    scenario = load("thesis-b")
-    scenario = msgspec.structs.replace(
-        with_world(scenario, unknown_starts=unknown, steps=200), seed=seed
-    )
+    scenario = with_world(load("thesis-b"), unknown_starts=unknown, steps=200)
+    scenario = with_options(scenario, seed=seed)
     streams = streams_of(scenario)
     return scenario, streams, list(run_team(final_only(scenario), streams))
 
@@ -36,14 +43,10 @@ def drive(seed, unknown=("*",)):
 def surveyed_landmarks(seed, numbers, wrong=None, origin=(0.0, 0.0)):
     _, streams, _ = drive(seed)
     noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (len(numbers), 2))
-    at = np.searchsorted(streams.landmark_ids, numbers)
-    found = []
-    for number, place in zip(
-        numbers, (streams.landmarks[at] + noise + origin).tolist(), strict=True
-    ):
-        x, y = np.add(place, (wrong or {}).get(number, (0.0, 0.0))).tolist()
-        found.append(SurveyedLandmark(number, x, y, sigma_m=SIGMA_M))
-    return tuple(found)
+    off = [(wrong or {}).get(number, (0.0, 0.0)) for number in numbers]
+    true = streams.landmarks[np.searchsorted(streams.landmark_ids, numbers)]
+    places = zip(numbers, (true + noise + origin + off).tolist(), strict=True)
+    return tuple(SurveyedLandmark(number, *place, sigma_m=SIGMA_M) for number, place in places)
 
 
 def fold_drive(seed, surveyed, *, unknown=("*",), maps=()) -> tuple[m.FusedMap, CentralNode]:
@@ -84,6 +87,7 @@ def test_two_surveyed_landmarks_make_the_map_absolute_without_any_known_start():
     assert fused.frame == SURVEY_FRAME
     assert {each.robot for each in fused.members} == {"r1", "r2"}
     assert not fused.changes
+    assert not [each for each in folded.reasons if "survey" in each]
     assert errors(fused, streams)[0] < 0.3
     found = evaluate(samples)
     assert not found.arbitrary_frame
@@ -107,14 +111,9 @@ def test_one_surveyed_landmark_and_a_known_start_are_in_one_frame():
 def test_a_surveyed_landmark_that_contradicts_the_rest_is_named_and_left_out(unknown):
     numbers = (3, 6, 9, 12, 15)
     fused, streams = day(1, numbers, unknown=unknown, wrong={9: (2.0, 1.0)})
-    words = [each for each in fused.reasons if "surveyed landmark" in each]
-    assert len(words) == 1
-    assert "the surveyed landmark 9 is (" in words[0]
+    (words,) = (each for each in fused.reasons if "surveyed landmark" in each)
+    assert "the surveyed landmark 9 is (" in words
     assert errors(fused, streams)[0] < 0.3
-
-
-def test_a_sound_survey_warns_of_nothing():
-    assert not [r for r in day(1, (3, 15))[0].reasons if "survey" in r]
 
 
 def test_a_survey_of_another_place_leaves_the_team_its_own_map():
@@ -162,3 +161,103 @@ def test_the_saved_map_of_a_surveyed_day_keeps_its_frame_on_later_days():
     assert any("second time" in each for each in fused.reasons)
     with pytest.raises(SavedMapError, match="surveyed"):
         map_name("survey")
+
+
+# Fixes of a satellite receiver.
+
+
+FIX_SIGMA_M = 0.3
+ANTENNA = (0.8, -0.5)
+DATUM = Datum(48.745, 9.105)
+
+
+def with_fixes(stream, seed, origin, jumps):
+    """A fix every 2 s at the antenna; jumps: indices of fixes displaced by 15 m."""
+    at = np.arange(0, len(stream.truth), 2)
+    x, y, turn = stream.truth[at].T
+    s, c = np.sin(turn), np.cos(turn)
+    (ahead, left), noise = ANTENNA, np.random.default_rng(seed).normal(0, FIX_SIGMA_M, (len(at), 2))
+    fixes = np.column_stack([x + c * ahead - s * left, y + s * ahead + c * left]) + noise + origin
+    fixes[list(jumps)] += [15.0, 0.0]
+    fixes = np.hstack([fixes, np.full((len(at), 3), np.nan)])
+    return dataclasses.replace(stream, fixes_ns=stream.truth_ns[at], fixes=fixes)
+
+
+@cache
+def day_with_fixes(*, origin=(0.0, 0.0), jumps=(), live=False):
+    """A day of `thesis-b` without known starts; r1 has fixes."""
+    scenario = with_world(load("thesis-b"), unknown_starts=("*",), steps=250)
+    scenario = with_robots(scenario, gnss=Gnss(antenna=ANTENNA, sigma_m=FIX_SIGMA_M))
+    scenario = with_front_ends(scenario, node_s=2.0)
+    central = msgspec.structs.replace(scenario.central, datum=DATUM)
+    scenario = msgspec.structs.replace(scenario, seed=3, central=central)
+    streams = streams_of(scenario)
+    first, *others = streams.streams
+    own = (with_fixes(first, 3, np.array(origin), jumps), *others)
+    scenario = scenario if live else final_only(scenario)
+    return list(run_team(scenario, dataclasses.replace(streams, streams=own))), streams
+
+
+def fixes_in(samples):
+    return [each for each in messages(samples, m.SightingFactor) if each.teammate == GNSS]
+
+
+def test_fixes_of_one_robot_place_a_team_without_known_starts():
+    samples, streams = day_with_fixes()
+    fused = final_map(samples)
+    assert fused.frame == SURVEY_FRAME
+    assert {each.robot for each in fused.members} == {"r1", "r2"}
+    assert not any("fixes" in each for each in fused.reasons)
+    rmse, nees = errors(fused, streams)
+    assert rmse < 0.3
+    assert nees < 2.0
+    used = [n for each in fixes_in(samples) for n in each.measurements]
+    assert len(used) == len(set(used)) > 50
+
+
+def test_a_fix_that_jumps_moves_nothing():
+    samples, streams = day_with_fixes(jumps=tuple(range(5, 120, 10)))
+    rmse, nees = errors(final_map(samples), streams)
+    assert rmse < 0.3
+    assert nees < 2.0
+
+
+def test_coordinates_of_a_national_grid_are_used_as_they_are():
+    samples, streams = day_with_fixes(origin=UTM)
+    plain = errors(final_map(day_with_fixes()[0]), streams)
+    assert errors(final_map(samples), streams, UTM) == pytest.approx(plain, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ({}, None),
+        ({"point": np.array([1e9, 0.0])}, "of its pose node"),
+        ({"covariance": 1e-30 * np.eye(2)}, "a sigma of"),
+        ({"covariance": 1e30 * np.eye(2)}, "a sigma of"),
+    ],
+)
+def test_a_fix_beyond_the_bounds_is_refused(changed, why):
+    first, *_ = fixes_in(day_with_fixes()[0])
+    found = sighting_beyond(dataclasses.replace(sighting_of(first), **changed), Bounds())
+    assert (found is None) if why is None else (found is not None and why in found)
+
+
+def test_maps_with_fixes_are_recomputed_from_the_log():
+    check_recomputed(day_with_fixes(live=True)[0])
+
+
+def test_a_map_of_fixes_keeps_the_datum_where_its_frame_is_the_datums_plane():
+    recorded = Recorded()
+    recorded.take_all(day_with_fixes()[0])
+    assert take_home(recorded).datum == DATUM
+    saved = recorded_map(recorded, "site")
+    assert datum_in(saved) == DATUM
+    first = map_figures(saved)["landmarks"][0]
+    assert abs(first["latitude_deg"] - DATUM.latitude_deg) < 1e-3
+    later = msgspec.structs.replace(saved, name="later")
+    final = final_map(day_with_fixes()[0])
+    assert datum_of(CentralConfig(), final, [later]) == DATUM
+    config = CentralConfig(datum=DATUM)
+    assert datum_of(config, msgspec.structs.replace(final, frame="r1/1"), []) is None
+    assert datum_of(config, final_map(day_with_fixes(origin=UTM)[0]), []) is None

@@ -1,4 +1,5 @@
 from collections import deque
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -22,16 +23,13 @@ STEPS = 9
 PATH_Y = {"alpha": 0.0, "bravo": 1.0, "charlie": -1.0}
 """The robots drive along the x axis, each on its own line, and see the same five landmarks."""
 OWN_IDS = 100  # added to the landmark ids of a robot that has none in common with the others
-_STREAMS: dict[tuple[str, bool, bool], list[m.Measurement]] = {}
 
 
+@cache
 def measured(robot: str, *, started: bool, apart: bool) -> list[m.Measurement]:
-    key = (robot, started, apart)
-    if key not in _STREAMS:
-        found = published(stream(robot, STEPS, known=started, y=PATH_Y[robot]))
-        offset = OWN_IDS * ord(robot[0]) if apart else 0
-        _STREAMS[key] = [renamed(each, offset) for each in found]
-    return _STREAMS[key]
+    found = published(stream(robot, STEPS, known=started, y=PATH_Y[robot]))
+    offset = OWN_IDS * ord(robot[0]) if apart else 0
+    return [renamed(each, offset) for each in found]
 
 
 def renamed(measurement: m.Measurement, offset: int) -> m.Measurement:
@@ -59,8 +57,7 @@ class Team:
         self.map: m.FusedMap | None = None
         self.log: list[Outgoing] = []
         for name in kinds:
-            token = build.liveliness(node=ch.robot_node(name))
-            self.to_centre(token)
+            self.to_centre(build.liveliness(node=ch.robot_node(name)))
 
     def measure(self, name: str) -> None:
         if self.coming[name]:
@@ -90,14 +87,12 @@ class Team:
                 self.sent[each.name].append(each.message)
             elif each.channel is ch.SUBMAP:
                 self.sent[each.name].append(each.message)
-                self.take(self.robots[each.name].handle(self.credit(each.message)))
-
-    def credit(self, submap: m.Submap) -> m.Progress:
-        return build.progress(node="central", robot=submap.robot, submaps=submap.sequence + 1)
+                count = each.message.sequence + 1
+                credit = build.progress(node="central", robot=each.name, submaps=count)
+                self.take(self.robots[each.name].handle(credit))
 
     def order_without(self, name: str) -> None:
-        order = build.withdrawal(robot=name)
-        self.to_centre(order)
+        self.to_centre(build.withdrawal(robot=name))
 
     def check(self) -> None:
         for name, pose in self.poses.items():

@@ -31,22 +31,21 @@ def two_robots() -> dict[str, list[m.Submap]]:
             translate.submap_message(
                 robot,
                 1,
-                each.sequence,
-                (10 * each.sequence + 1, 10 * each.sequence + 10),
+                k,
+                (10 * k + 1, 10 * k + 10),
                 (each.end_ns - 10**10, each.end_ns),
                 bytes(8),
                 each.local,
             )
-            for each in submaps
+            for k, each in enumerate(submaps)
         ]
     return found
 
 
-def _rule() -> MapPublisher:
+def _rule(*messages: m.Message) -> MapPublisher:
     rule = MapPublisher(SubmapFold(CONFIG, bytes(8)))
-    for robot in two_robots():
-        start = build.initial_pose(robot=robot)
-        rule.store.add_start(start)
+    for message in (*(build.initial_pose(robot=robot) for robot in two_robots()), *messages):
+        rule.store.add(message)
     return rule
 
 
@@ -64,11 +63,7 @@ def _final(rule: MapPublisher) -> m.FusedMap:
 
 @pytest.fixture(scope="module")
 def final():
-    rule = _rule()
-    for robot in two_robots():
-        for submap in two_robots()[robot]:
-            rule.store.add(submap)
-    return _final(rule)
+    return _final(_rule(*two_robots()["r1"], *two_robots()["r2"]))
 
 
 def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(final):
@@ -87,10 +82,8 @@ def test_late_submaps_and_maps_in_between_change_no_byte_of_the_final_map(final)
 def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map():
     maps = []
     for order in permutations(("r1", "r2", "verdict")):
-        rule = _rule()
-        for what in order[:3]:
-            for message in [_verdict()] if what == "verdict" else two_robots()[what]:
-                rule.store.add(message)
+        parts = {**two_robots(), "verdict": [_verdict()]}
+        rule = _rule(*(message for what in order for message in parts[what]))
         if order[0] == "r1":
             maps.append(_final(rule))
     assert len({encoded(each) for each in maps}) == 1
@@ -99,10 +92,7 @@ def test_a_verdict_is_a_member_of_the_set_whenever_it_comes_and_names_the_map():
 
 def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said(final):
     for order in ((_verdict(), _verdict(withdrawn=True)), (_verdict(withdrawn=True), _verdict())):
-        rule = _rule()
-        for message in (*two_robots()["r1"], order[0], *two_robots()["r2"], order[1]):
-            rule.store.add(message)
-        found = _final(rule)
+        found = _final(_rule(*two_robots()["r1"], order[0], *two_robots()["r2"], order[1]))
         assert found.verdicts == ()
         assert (found.means, found.digest) == (final.means, final.digest)
 
@@ -110,31 +100,20 @@ def test_a_verdict_that_is_withdrawn_leaves_the_map_as_if_it_had_never_been_said
 def test_a_map_is_computed_again_from_the_verdicts_that_it_names(final):
     maps = []
     for verdicts in ([_verdict()], []):
-        fold = _rule().fold
-        for message in (*verdicts, *two_robots()["r1"], *two_robots()["r2"]):
-            fold.store.add(message)
+        fold = _rule(*verdicts, *two_robots()["r1"], *two_robots()["r2"]).fold
         maps.append(fold.make_map("final", recorded=RecordedFields((), 0, ()))[-1].message)
     with_verdict, without = maps
-    assert isinstance(with_verdict, m.FusedMap)
-    assert isinstance(without, m.FusedMap)
     assert with_verdict.digest != without.digest
     assert without.means == final.means
 
 
 def test_a_robot_that_is_withdrawn_leaves_the_landmarks_as_if_it_had_never_been():
     order = build.withdrawal(robot="r2", reason="")
-    alone = _rule()
-    for submap in two_robots()["r1"]:
-        alone.store.add(submap)
-    wanted = _final(alone)
+    wanted = _final(_rule(*two_robots()["r1"]))
+    both = [each for pair in zip(*two_robots().values(), strict=True) for each in pair]
     maps = []
     for at in (0, 5, 16):
         rule = _rule()
-        both = [
-            each
-            for pair in zip(two_robots()["r1"], two_robots()["r2"], strict=True)
-            for each in pair
-        ]
         for k, message in enumerate([*both[:at], order, *both[at:]]):
             rule.store.add(message)
             if k % 6 == 5:

@@ -65,15 +65,9 @@ def run(of: Scenario, wrong: str = "") -> list[Sample]:
     robots = [msgspec.structs.replace(r, sensor=sensor) if r.id == "r3" else r for r in of.robots]
     streams = simulate(of.world, robots, of.seed)
     if wrong == "odometry":
-        streams = replace(
-            streams,
-            streams=tuple(
-                replace(s, intervals=replace(s.intervals, forward=1.3 * s.intervals.forward))
-                if s.robot == "r3"
-                else s
-                for s in streams.streams
-            ),
-        )
+        *others, last = streams.streams
+        fast = replace(last.intervals, forward=1.3 * last.intervals.forward)
+        streams = replace(streams, streams=(*others, replace(last, intervals=fast)))
     return list(run_team(of, streams))
 
 
@@ -91,12 +85,13 @@ def of_set(
     without: str = "",
     central: CentralConfig | None = None,
     instead: m.Submap | None = None,
+    into: TickFold | None = None,
 ) -> TickFold:
     """The fold over a run's submaps; without: robot left out from the beginning.
 
-    instead: a submap in place of the one of its name.
+    instead: a submap in place of the one of its name. into: the fold, else a new one.
     """
-    ticks = TickFold(scenario().central if central is None else central)
+    ticks = into or TickFold(scenario().central if central is None else central)
     for start in messages(samples, m.InitialPose):
         ticks.add_start(translate.start_of(start))
     sightings = messages(samples, m.SightingFactor)
@@ -123,16 +118,11 @@ def test_the_fold_after_a_withdrawal_is_that_of_a_team_that_never_had_the_robot(
     met = messages(samples, m.SightingFactor)
     assert any(s.robot == "r3" for s in met)
     assert any(s.teammate == "r3" for s in met)
-    whole = of_set(samples)
+    whole = TickFold(scenario().central)
     if when == "before":
-        whole = TickFold(scenario().central)
         whole.withdraw_robot("r3")
-        for start in messages(samples, m.InitialPose):
-            whole.add_start(translate.start_of(start))
-        for each in messages(samples, m.Submap):
-            own = [s for s in met if (s.robot, s.sequence) == (each.robot, each.sequence)]
-            whole.add_submap(each, bytes(8), own)
-    else:
+    of_set(samples, into=whole)
+    if when != "before":
         whole.fold_until(30e9 if when == "in the middle" else math.inf)
         whole.withdraw_robot("r3")
     assert whole.withdrawn == ("r3",)
@@ -152,13 +142,11 @@ def test_the_fold_without_a_robot_leaves_the_fold_with_it_as_it_was():
 
 def rule_with(samples: tuple[Sample, ...], *withdrawals: m.Withdrawal) -> MapPublisher:
     rule = MapPublisher(SubmapFold(scenario(withdraw_above=None).central, bytes(8)))
-    for message in (*messages(samples, m.InitialPose), *withdrawals):
-        take = rule.store.add_start if isinstance(message, m.InitialPose) else rule.withdraw
-        take(message)
-    for sighting in messages(samples, m.SightingFactor):
-        rule.store.add_sighting(sighting)
-    for submap in messages(samples, m.Submap):
-        rule.store.add_submap(submap)
+    for order in withdrawals:
+        rule.withdraw(order)
+    for kind in (m.InitialPose, m.SightingFactor, m.Submap):
+        for message in messages(samples, kind):
+            rule.store.add(message)
     return rule
 
 
@@ -234,13 +222,10 @@ def delivered(order: list[m.Message], watermarks: dict[int, float]) -> tuple[Map
     rule = MapPublisher(SubmapFold(CentralConfig(tick_s=5.0, broadcast_s=5.0), bytes(8)))
     for start in one_closes_windows_often():
         if isinstance(start, m.InitialPose):
-            rule.store.add_start(start)
+            rule.store.add(start)
     out = []
     for k, message in enumerate(order):
-        if isinstance(message, m.Submap):
-            rule.store.add_submap(message)
-        else:
-            rule.store.add_sighting(message)
+        rule.store.add(message)
         if k in watermarks:
             out += rule.publish_due(1e9 * watermarks[k], round(1e9 * watermarks[k]))
     out += rule.publish_final(10**12)
@@ -271,8 +256,7 @@ def test_who_was_convicted_without_what_comes_late_is_acquitted():
     assert list(ticks.convicted) == ["r3"]
     again = next(each for each in messages(samples, m.Submap) if each.robot == "r3")
     sightings = messages(samples, m.SightingFactor)
-    name = (again.robot, again.incarnation, again.sequence)
-    own = [each for each in sightings if (each.robot, each.incarnation, each.sequence) == name]
+    own = [each for each in sightings if (each.robot, each.sequence) == ("r3", again.sequence)]
     ticks.add_submap(again, bytes(8), own)
     assert (ticks.convicted, ticks.withdrawn) == ({}, ())
     ticks.fold_until(math.inf)

@@ -2,25 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from teamslam.team.estimation.consistency import chi2_interval, nees
+from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.alignment import Maps, align
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
-from teamslam.team.estimation.map_joining.marginals import (
-    joint_cost,
-    landmark_map,
-)
-from tests.estimation.hybrid_slam.test_sensitivity import (
-    SIGMA,
-    biased_team,
-    fold_of,
-)
-from tests.estimation.map_joining.test_alignment import (
-    pairs,
-)
-from tests.estimation.map_joining.test_joining import (
-    joined,
-)
+from teamslam.team.estimation.map_joining.marginals import joint_cost, landmark_map
+from tests.consistency import RIGHT, TOO_SMALL, judge
+from tests.estimation.hybrid_slam.test_sensitivity import SIGMA, biased_team, fold_of
+from tests.estimation.map_joining.test_alignment import pairs
+from tests.estimation.map_joining.test_joining import joined
 from tests.estimation.sighting_world import joined_with, meeting
 from tests.estimation.submap_world import correlated, seen_from, solved, team, wrap
 
@@ -28,10 +18,7 @@ RUNS = 100
 
 
 def consistency(runs):
-    """Mean NEES and mean joint cost, each per degree of freedom, with it.
-
-    runs: pairs of a fold and the true landmarks.
-    """
+    """Judge NEES and joint cost of pairs of a fold and the true landmarks."""
     errors = cost = dof = joint = 0.0
     for fold, landmarks in runs:
         found = landmark_map(fold)
@@ -41,26 +28,20 @@ def consistency(runs):
         agreement = joint_cost(fold)
         cost += agreement.chi2
         joint += agreement.dof
-    return errors / dof, round(dof), cost / joint, round(joint)
+    return judge(errors / dof, round(dof)), judge(cost / joint, round(joint))
 
 
 def teams(options):
     for seed in range(RUNS):
         world = team(seed, robots=2, submaps=5, landmarks=4)
-        yield (
-            solved(joined(world.submaps, world.starts, options, tick=10), options),
-            world.landmarks,
-        )
+        fold = joined(world.submaps, world.starts, options, tick=10)
+        yield solved(fold, options), world.landmarks
 
 
 def test_map_and_joint_cost_are_consistent_and_a_submap_counted_twice_is_not():
-    ratio, dof, cost, joint = consistency(teams(JoinSettings()))
-    low, high = chi2_interval(dof, 0.999, 1)
-    assert low < ratio < high
-    least, most = chi2_interval(joint, 0.999, 1)
-    assert least < cost < most
-    twice, _, _, _ = consistency(teams(JoinSettings(covariance_factor=0.5)))
-    assert twice > high
+    assert consistency(teams(JoinSettings())) == (RIGHT, RIGHT)
+    twice, _ = consistency(teams(JoinSettings(covariance_factor=0.5)))
+    assert twice == TOO_SMALL
 
 
 def meetings(change):
@@ -72,13 +53,9 @@ def meetings(change):
 
 
 def test_a_map_with_sightings_is_consistent_and_one_that_counts_each_fourfold_is_not():
-    ratio, dof, cost, joint = consistency(meetings(1.0))
-    low, high = chi2_interval(dof, 0.999, 1)
-    assert low < ratio < high
-    least, most = chi2_interval(joint, 0.999, 1)
-    assert least < cost < most
-    _, _, cost_of_mutant, _ = consistency(meetings(0.25))
-    assert cost_of_mutant > most
+    assert consistency(meetings(1.0)) == (RIGHT, RIGHT)
+    _, cost_of_mutant = consistency(meetings(0.25))
+    assert cost_of_mutant == TOO_SMALL
 
 
 def test_the_alignment_and_its_chi_square_are_consistent():
@@ -97,10 +74,8 @@ def test_the_alignment_and_its_chi_square_are_consistent():
         errors += nees(error, found.covariance)
         cost += found.chi2
         assert found.dof == 5
-    low, high = chi2_interval(3, 0.999, runs)
-    assert low < errors / (3 * runs) < high
-    low, high = chi2_interval(5, 0.999, runs)
-    assert low < cost / (5 * runs) < high
+    assert judge(errors / (3 * runs), 3, runs) == RIGHT
+    assert judge(cost / (5 * runs), 5, runs) == RIGHT
 
 
 def without_columns(submaps):
@@ -131,9 +106,7 @@ SEEDS = range(100)
 
 def test_map_and_biases_are_consistent_and_without_bias_states_they_are_not():
     of_map, of_biases = nees_of_map_and_biases(SEEDS)
-    low, high = chi2_interval(10, 0.999, len(SEEDS))
-    assert low < of_map < high
-    low, high = chi2_interval(4, 0.999, len(SEEDS))
-    assert low < of_biases < high
+    assert judge(of_map, 10, len(SEEDS)) == RIGHT
+    assert judge(of_biases, 4, len(SEEDS)) == RIGHT
     mutant, _ = nees_of_map_and_biases(SEEDS[:15], blind=True)
     assert mutant > 2.0

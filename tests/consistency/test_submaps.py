@@ -3,15 +3,10 @@ import pytest
 from scipy.stats import chi2
 
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.consistency import nees, state_error
 from teamslam.team.estimation.hybrid_slam import window as windows
-from tests.estimation.hybrid_slam.test_window import (
-    ACCURATE,
-    COARSE,
-    STEP_M,
-    drive,
-    driven,
-)
+from tests.consistency import RIGHT, TOO_LARGE, TOO_SMALL, judge
+from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, STEP_M, drive, driven
 
 
 def submap_errors(sensor, particles, runs, **options):
@@ -33,8 +28,7 @@ def ratio(results):
 @pytest.mark.parametrize("sensor", [ACCURATE, COARSE], ids=["accurate", "coarse"])
 def test_the_submaps_of_many_particles_are_consistent(sensor):
     results = submap_errors(sensor, particles=400, runs=200)
-    low, high = chi2_interval(int(results[:, 1].sum()), 0.999, 1)
-    assert low < ratio(results) < high
+    assert judge(ratio(results), int(results[:, 1].sum())) == RIGHT
 
 
 @pytest.mark.parametrize("sensor", [ACCURATE, COARSE], ids=["accurate", "coarse"])
@@ -49,14 +43,13 @@ def test_a_hundred_particles_are_consistent_within_a_tenth_and_two_of_each_measu
     assert ratio(submap_errors(sensor, particles=100, runs=60, twice=True)) > 1.5
 
 
-def per_dof(sensor, runs=200, told=None, **options):
-    """Mean over seeded windows, and its 99.9 % interval."""
+def innovations(sensor, runs=200, told=None, **options):
+    """Judge the innovations of seeded windows."""
     found = [
         driven(drive(s, sensor, steps=6), told or sensor, seed=s, **options) for s in range(runs)
     ]
     squared, dof = (sum(w.innovation[k] for w in found) for k in (0, 1))
-    low, high = chi2_interval(dof, 0.999, 1)
-    return low, squared / dof, high
+    return judge(squared / dof, dof)
 
 
 @pytest.mark.parametrize(
@@ -64,8 +57,7 @@ def per_dof(sensor, runs=200, told=None, **options):
     [(COARSE, "fastslam2"), (ACCURATE, "fastslam2"), (ACCURATE, "fastslam1")],
 )
 def test_right_models_have_an_innovation_of_one_per_degree_of_freedom(sensor, proposal):
-    low, found, high = per_dof(sensor, proposal=proposal)
-    assert low < found < high
+    assert innovations(sensor, proposal=proposal) == RIGHT
 
 
 def scaled(sensor, factor):
@@ -82,15 +74,14 @@ SLUGGISH = MotionModel(
 
 
 @pytest.mark.parametrize(
-    ("wrong", "above"),
+    ("wrong", "judged"),
     [
-        ({"told": scaled(ACCURATE, 0.9)}, True),
-        ({"told": scaled(ACCURATE, 1.1)}, False),
-        ({"motion": SLUGGISH}, True),
-        ({"twice": True}, False),
+        ({"told": scaled(ACCURATE, 0.9)}, TOO_SMALL),
+        ({"told": scaled(ACCURATE, 1.1)}, TOO_LARGE),
+        ({"motion": SLUGGISH}, TOO_SMALL),
+        ({"twice": True}, TOO_LARGE),
     ],
     ids=["sensor noise too small", "too large", "motion noise too small", "each measurement twice"],
 )
-def test_wrong_models_have_another(wrong, above):
-    low, found, high = per_dof(ACCURATE, **wrong)
-    assert found > high if above else found < low
+def test_wrong_models_have_another(wrong, judged):
+    assert innovations(ACCURATE, **wrong) == judged

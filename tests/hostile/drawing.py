@@ -82,10 +82,6 @@ def packed(P: np.ndarray) -> bytes:
     return from_floats(P[np.triu_indices(len(P))])
 
 
-def initial_pose(robot: str) -> m.InitialPose:
-    return build.initial_pose(robot=robot)
-
-
 class Team:
     """A hostile team: chains of submaps that continue, so that a set accepts them.
 
@@ -108,7 +104,7 @@ class Team:
 
     def start(self, robot: str) -> m.InitialPose:
         rng = self._rng
-        unknown = initial_pose(robot)
+        unknown = build.initial_pose(robot=robot)
         if rng.random() < 0.5:
             return unknown
         pose = from_floats(np.append(numbers(rng, 2), rng.uniform(-3.0, 3.0)))
@@ -170,10 +166,7 @@ class Team:
             )
             for _ in range(2)
         )
-        judgement = m.Judgement(first=first, second=second, same=bool(rng.random() < 0.5))
-        return m.Verdict(
-            stamp_ns=0, robot=first.robot, judgement=judgement, by="operator", reason="it is so"
-        )
+        return build.verdict(first, second, same=bool(rng.random() < 0.5))
 
     def _sighting(self, submap: m.Submap, stamp_ns: int) -> m.SightingFactor:
         rng = self._rng
@@ -195,24 +188,12 @@ class Team:
         return last_words(self._next)
 
 
-def progress(robot: str, submaps: int) -> m.Progress:
-    return build.progress(
-        stamp_ns=submaps * 10 * S, robot=robot, measurements=1000, submaps=submaps
-    )
-
-
 def last_words(submaps: Mapping[str, int]) -> list[m.Message]:
     out: list[m.Message] = []
     for robot, count in submaps.items():
-        said = progress(robot, count)
-        done = build.done(
-            stamp_ns=said.stamp_ns,
-            robot=robot,
-            measurements=said.measurements,
-            steps=500,
-            submaps=count,
-        )
-        out += [said, done]
+        counts = {"robot": robot, "measurements": 1000, "submaps": count}
+        at = {"stamp_ns": count * 10 * S}
+        out += [build.progress(**at, **counts), build.done(**at, **counts, steps=500)]
     return [*out, build.end(10**12, **dict.fromkeys(ROBOTS, 1000))]
 
 
@@ -333,9 +314,8 @@ def robot_session(
         out += node.handle(found)
         answers = [each.message for each in out if isinstance(each.message, m.Submap)]
         if answers:
-            out += node.handle(
-                build.progress(node="central", robot=node.robot, submaps=len(answers))
-            )
+            credit = build.progress(node="central", robot=node.robot, submaps=len(answers))
+            out += node.handle(credit)
     for each in [*out, Outgoing(out[0].channel, "", node.status())]:
         decoded(encoded(each.message), type(each.message))
     return node, out
@@ -412,12 +392,10 @@ def _other(rng: np.random.Generator, name: str, value: Any) -> Any:
     match value:
         case bool():
             return not value
+        case int() if rng.random() < 0.8:
+            return int(rng.choice(INTEGERS))
         case int():
-            return (
-                int(rng.choice(INTEGERS))
-                if rng.random() < 0.8
-                else value + int(rng.integers(-2, 3))
-            )
+            return value + int(rng.integers(-2, 3))
         case float():
             return float(rng.choice(FLOATS))
         case str():
@@ -430,9 +408,8 @@ def _other(rng: np.random.Generator, name: str, value: Any) -> Any:
             return {str(key): float(rng.choice(FLOATS)) for key in rng.choice(TEXTS, 3)}
         case msgspec.Struct():
             chosen = str(rng.choice(value.__struct_fields__))
-            return msgspec.structs.replace(
-                value, **{chosen: _other(rng, chosen, getattr(value, chosen))}
-            )
+            other = _other(rng, chosen, getattr(value, chosen))
+            return msgspec.structs.replace(value, **{chosen: other})
         case _:
             return value
 

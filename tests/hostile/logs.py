@@ -48,13 +48,11 @@ def records_of(told: Sequence[tuple[ch.Channel, str, bytes]]) -> bytes:
     keys = [f"team/demo/{channel.key(name)}" for channel, name, _ in told]
     numbers = {key: k + 1 for k, key in enumerate(dict.fromkeys(keys))}
     for key, number in numbers.items():
-        Channel(id=number, topic=key, message_encoding="msgpack", metadata={}, schema_id=0).write(
-            out
-        )
+        row = {"topic": key, "message_encoding": "msgpack", "metadata": {}, "schema_id": 0}
+        Channel(id=number, **row).write(out)
     for key, (_, _, payload) in zip(keys, told, strict=True):
-        Message(
-            channel_id=numbers[key], log_time=1, data=payload, publish_time=1, sequence=0
-        ).write(out)
+        at = {"log_time": 1, "publish_time": 1, "sequence": 0}
+        Message(channel_id=numbers[key], data=payload, **at).write(out)
     return out.end()
 
 
@@ -79,44 +77,18 @@ def few_large(path: Path) -> Path:
 def far_counters(path: Path) -> Path:
     far = 2**60
     joint = from_floats([0.0] * 5)
-    submap = build.submap(
-        stamp_ns=9,
-        robot="alpha",
-        first_measurement=0,
-        last_measurement=far,
-        start_ns=1,
-        config=DIGEST,
-        ids=[1],
-        mean=joint,
-        covariance=packed(spd(5)),
-    )
+    counts = {"first_measurement": 0, "last_measurement": far}
+    map_ = {"ids": [1], "mean": joint, "covariance": packed(spd(5))}
+    submap = build.submap(stamp_ns=9, robot="alpha", start_ns=1, config=DIGEST, **counts, **map_)
     told: list[tuple[ch.Channel, str, m.Message]] = [
-        (
-            ch.START,
-            "alpha",
-            build.initial_pose(robot="alpha"),
-        ),
-        (
-            ch.ODOMETRY,
-            "alpha",
-            build.odometry(stamp_ns=5, robot="alpha", number=1, duration_ns=5, forward=0.5),
-        ),
-        (
-            ch.ODOMETRY,
-            "alpha",
-            build.odometry(stamp_ns=2**61, robot="alpha", number=far, duration_ns=5, forward=0.5),
+        (ch.START, "alpha", build.initial_pose(robot="alpha")),
+        *(
+            (ch.ODOMETRY, "alpha", build.odometry(stamp_ns=at, robot="alpha", number=number))
+            for at, number in ((5, 1), (2**61, far))
         ),
         (ch.SUBMAP, "alpha", submap),
-        (
-            ch.ROBOT_DONE,
-            "alpha",
-            build.done(stamp_ns=9, robot="alpha", measurements=far, steps=far, submaps=1),
-        ),
-        (
-            ch.END,
-            "",
-            build.end(2**61, alpha=far),
-        ),
+        (ch.ROBOT_DONE, "alpha", build.done(robot="alpha", measurements=far, steps=far, submaps=1)),
+        (ch.END, "", build.end(2**61, alpha=far)),
     ]
     return log_of(path, records_of([(c, n, encoded(message)) for c, n, message in told]))
 

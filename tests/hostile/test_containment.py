@@ -73,10 +73,10 @@ def test_a_measurement_that_raises_is_named_and_its_robot_maps_on_as_if_it_had_n
         ledger = {each.disposition: each.measurements for each in done.ledger}
         assert ledger[Rejection.SET_ASIDE.disposition] == 1
     assert {x.robot for x in final_map(samples).members} == {"r1", "r2"}
-    (r1, r2), evaluation = told, evaluate(samples)
+    evaluation = evaluate(samples)
     assert evaluation.faults == 2
     assert [note.partition(",")[0] for note in evaluation.notes] == [
-        f"{f.node} set 1 messages aside; the first" for f in (r1, r2)
+        f"{f.node} set 1 messages aside; the first" for f in told
     ]
     result = verify(written(tmp_path / "log.mcap", samples))
     assert result.first is None, str(result.first)
@@ -129,11 +129,12 @@ def test_a_submap_that_raises_at_the_centre_is_acknowledged_and_the_others_are_i
     assert m.VersionEntry(robot="r1", incarnation=done.incarnation, sequence=1) in final.missing
 
 
-def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(monkeypatch):
-    def conclude(self: MapPublisher, now_ns: int) -> list[Outgoing]:
-        raise np.linalg.LinAlgError("singular")
+def singular(*_: object) -> list[Outgoing]:
+    raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(MapPublisher, "publish_final", conclude)
+
+def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says_so(monkeypatch):
+    monkeypatch.setattr(MapPublisher, "publish_final", singular)
     samples = list(team_samples(thesis(45)))
     final = final_map(samples)
     assert final.provisional
@@ -142,11 +143,8 @@ def test_where_the_final_map_raises_the_newest_one_is_final_provisional_and_says
 
 
 def test_running_maps_that_raise_take_nothing_from_the_final_one(monkeypatch):
-    def advance(self: MapPublisher, closed_ns: float, now_ns: int) -> list[Outgoing]:
-        raise np.linalg.LinAlgError("singular")
-
     whole = final_map(list(team_samples(thesis(20))))
-    monkeypatch.setattr(MapPublisher, "publish_due", advance)
+    monkeypatch.setattr(MapPublisher, "publish_due", singular)
     final = final_map(list(team_samples(thesis(20))))
     assert not final.provisional
     assert (final.means, final.covariance) == (whole.means, whole.covariance)
@@ -170,15 +168,10 @@ def test_a_reply_that_is_none_is_refused_and_a_robot_that_can_not_resume_begins_
 
 
 def test_a_token_with_a_name_that_no_node_has_ends_neither_centre_nor_recorder(tmp_path):
-    network = MemoryNetwork()
-    stranger = MemoryBus(network)
-    stranger.declare_alive("robot/" + "a" * 25_000)
+    network, name = MemoryNetwork(), "robot/" + "a" * 25_000
+    MemoryBus(network).declare_alive(name)
     shell = CentralShell(MemoryBus(network), CENTRE, ["r1"], threading.Event())
-    token = Sample(
-        ch.ALIVE.key("robot/" + "a" * 25_000),
-        encoded(build.liveliness(node="robot/" + "a" * 25_000)),
-        0, 0, 0,
-    )  # fmt: skip
+    token = Sample(ch.ALIVE.key(name), encoded(build.liveliness(node=name)), 0, 0, 0)
     shell._shell.take(shell._patient([token]))
     assert shell._shell.boundary.refused == 1
     with Recorder(tmp_path / "log.mcap", "t", {}) as recorder:

@@ -21,8 +21,8 @@ HUGE = 2**62
 STREAMS = {name: stream(name, 12, y=y) for name, y in (("r1", 0.0), ("r2", 1.0))}
 MEASUREMENTS = {name: published(each) for name, each in STREAMS.items()}
 SUBMAPS = Submaps(list(STREAMS.values()))
-END = build.end(**{n: len(s) for n, s in STREAMS.items()})
-FINAL = example(m.FusedMap)
+COUNTS = {name: len(each) for name, each in STREAMS.items()}
+END = build.end(**COUNTS)
 
 
 def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
@@ -50,14 +50,8 @@ def run() -> list[tuple[ch.Channel, str, m.Message]]:
         said += [(ch.SUBMAP, name, submap) for submap in submaps]
         said.append((ch.ROBOT_PROGRESS, name, progress(name, count, len(submaps))))
     for name, submaps in SUBMAPS.items():
-        done = build.done(
-            stamp_ns=12 * 10**9,
-            robot=name,
-            measurements=len(MEASUREMENTS[name]),
-            steps=12,
-            submaps=len(submaps),
-        )
-        said.append((ch.ROBOT_DONE, name, done))
+        counts = {"measurements": len(MEASUREMENTS[name]), "steps": 12, "submaps": len(submaps)}
+        said.append((ch.ROBOT_DONE, name, build.done(stamp_ns=12 * 10**9, robot=name, **counts)))
     return [*said, (ch.END, "", END)]
 
 
@@ -70,35 +64,12 @@ ATTACKS = [
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, HUGE), f"counts to {HUGE}"),
     (ch.ROBOT_PROGRESS, "r1", progress("r1", 5, 1, 4e9), "days after its stream began"),
     (ch.ROBOT_PROGRESS, "r1", progress("r2", 5, 1), "a message of 'r2' on the key"),
-    (
-        ch.ROBOT_PROGRESS,
-        "r1",
-        build.progress(node="central", measurements=5, submaps=1),
-        "a message of 'central'",
-    ),
+    (ch.ROBOT_PROGRESS, "r1", build.progress(node="central"), "a message of 'central'"),
     (ch.END, "", build.end(), "an end that omits r1, r2"),
-    (
-        ch.END,
-        "",
-        build.end(**dict.fromkeys(STREAMS, 3)),
-        "ends with measurement 3",
-    ),
-    (
-        ch.END,
-        "",
-        m.End(
-            stamp_ns=0,
-            streams=(*END.streams, m.StreamEnd(robot="r9", incarnation=1, measurements=3)),
-        ),
-        "of r9, not in this team",
-    ),
-    (
-        ch.ORDER,
-        "r1",
-        build.withdrawal(by="central", reason="so"),
-        "a message of 'central' on the key",
-    ),
-    (ch.ORDER, "r9", build.withdrawal(robot="r9", reason="so"), "of r9, not in this team"),
+    (ch.END, "", build.end(**dict.fromkeys(STREAMS, 3)), "ends with measurement 3"),
+    (ch.END, "", build.end(**COUNTS, r9=3), "of r9, not in this team"),
+    (ch.ORDER, "r1", build.withdrawal(by="central"), "a message of 'central' on the key"),
+    (ch.ORDER, "r9", build.withdrawal(robot="r9"), "of r9, not in this team"),
 ]
 
 
@@ -118,10 +89,8 @@ def test_a_centre_refuses_what_can_not_be_and_its_map_stays():
         out += given(boundary, node, (channel, name, message))
         assert boundary.refused == count, why
         assert why in boundary.warnings[0]
-    assert (
-        f"{len(ATTACKS)} dropped at the door, the last: operator/withdrawal/r9: of r9"
-        in (boundary.warnings[0])
-    )
+    last = f"{len(ATTACKS)} dropped at the door, the last: operator/withdrawal/r9: of r9"
+    assert last in boundary.warnings[0]
     out += given(boundary, node, said[-1])
     (final,) = of(out, ch.FINAL_MAP)
     assert encoded(final) == encoded(wanted)
@@ -148,11 +117,7 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
         (ch.ODOMETRY, far, "days after its stream began"),
         (ch.CENTRAL_PROGRESS, acknowledged, "acknowledges 1000000 submaps of"),
         (ch.END, build.end(), "an end that omits r1"),
-        (
-            ch.END,
-            build.end(r1=2),
-            "ends with measurement 2 of r1",
-        ),
+        (ch.END, build.end(r1=2), "ends with measurement 2 of r1"),
     ]
     for count, (channel, message, why) in enumerate(attacks, 1):
         out += given(boundary, node, (channel, "r1", message))
@@ -161,35 +126,34 @@ def test_a_robot_refuses_what_can_not_be_of_its_stream_and_sends_the_same_submap
     with pytest.raises(WireError, match="of 'r2' is no reply to 'source/r1/readings'"):
         read_reply(ch.MEASUREMENTS, "r1", reply, 0)
     out += given(boundary, node, *measurements[8:], (ch.END, "", END))
-    assert [encoded(each) for each in of(out, ch.SUBMAP)] == [
-        encoded(each) for each in of(wanted, ch.SUBMAP)
-    ]
+    sent, expected = ([*map(encoded, of(each, ch.SUBMAP))] for each in (out, wanted))
+    assert sent == expected
     assert of(out, ch.ROBOT_DONE) == of(wanted, ch.ROBOT_DONE)
 
 
-def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own():
-    streams = world_of(*STREAMS.values())
+def world() -> tuple[Boundary, WorldNode]:
     announced = announce_configuration("world", 0, 0, RobotConfig("r1"))
-    node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
+    return Boundary("world"), WorldNode(world_of(*STREAMS.values()), frozenset(), announced)
+
+
+def test_a_world_takes_no_credit_for_what_never_was_and_no_end_before_its_own():
+    boundary, node = world()
+    final = (ch.FINAL_MAP, "", example(m.FusedMap, final=True))
+    recorded = build.progress(node="recorder", incarnation=7, measurements=1, submaps=1)
     assert node.publish(0.0)
     node.ended = False
     for channel, name, message, why in (
         (ch.ROBOT_PROGRESS, "r1", progress("r1", 10**6, 1), "consumed 1000000 of"),
         (ch.ROBOT_PROGRESS, "r9", progress("r9", 1, 1), "of r9, not in this team"),
-        (
-            ch.RECORDER_PROGRESS,
-            "r1",
-            build.progress(node="recorder", incarnation=7, measurements=1, submaps=1),
-            "incarnation 7",
-        ),
-        (ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=True), "before the end"),
+        (ch.RECORDER_PROGRESS, "r1", recorded, "incarnation 7"),
+        (*final, "before the end"),
     ):
         before = boundary.refused
         assert given(boundary, node, (channel, name, message)) == []
         assert (boundary.refused, why in boundary.last_refused) == (before + 1, True), why
     assert not node.finished
     node.ended = True
-    given(boundary, node, (ch.FINAL_MAP, "", msgspec.structs.replace(FINAL, final=True)))
+    given(boundary, node, final)
     assert node.finished
 
 
@@ -206,23 +170,27 @@ def test_an_end_against_anybodys_word_is_believed_when_all_robots_are_done_there
     (*said, end) = run()
     done = [each for each in said if each[0] == ch.ROBOT_DONE]
     before = [each for each in said if each[0] != ch.ROBOT_DONE]
-    honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
-    given(Boundary("central"), honest, *before, end, *done)
-    boundary = Boundary("central")
+    boundary, misled = centre()
     forged = (ch.ROBOT_PROGRESS, "r1", progress("r1", 1000, len(SUBMAPS["r1"])))
     given(boundary, misled, *before, forged, end)
     assert boundary.refused == 1
     assert misled.final is None
     given(boundary, misled, *done)
-    assert misled.final is not None
+    assert_final_of(misled, *before, end, *done)
+
+
+def assert_final_of(misled: CentralNode, *said: tuple[ch.Channel, str, m.Message]) -> None:
+    """Check that it has the final map of a centre that received these messages alone."""
+    boundary, honest = centre()
+    given(boundary, honest, *said)
     assert honest.final is not None
+    assert misled.final is not None
     assert encoded(misled.final) == encoded(honest.final)
 
 
 def done_of(robot: str, incarnation: int, measurements: int, submaps: int) -> m.Done:
-    return build.done(
-        robot=robot, incarnation=incarnation, measurements=measurements, submaps=submaps
-    )
+    life = {"robot": robot, "incarnation": incarnation}
+    return build.done(**life, measurements=measurements, submaps=submaps)
 
 
 def end_of(robot: str, incarnation: int, measurements: int) -> m.End:
@@ -231,7 +199,6 @@ def end_of(robot: str, incarnation: int, measurements: int) -> m.End:
     return m.End(stamp_ns=0, streams=(mine, other))
 
 
-FAR_START = build.initial_pose(stamp_ns=2**61)
 FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
     "last words of a later incarnation": [(ch.ROBOT_DONE, "r1", done_of("r1", 900, 5, 0))],
     "last words of submaps that never were": [(ch.ROBOT_DONE, "r1", done_of("r1", 1, 5, 9))],
@@ -249,30 +216,22 @@ FORGED: dict[str, list[tuple[ch.Channel, str, m.Message]]] = {
 @pytest.mark.parametrize("what", FORGED)
 def test_no_word_of_a_stranger_on_how_far_a_team_is_keeps_it_from_its_end(what, behind):
     (*said, end) = run()
-    honest, misled = (CentralNode(CentralConfig(), list(STREAMS)) for _ in range(2))
-    given(Boundary("central"), honest, *said, end)
     forged = FORGED[what]
-    order = [*said, *forged, end] if behind else [*forged, *said, end]
-    given(Boundary("central"), misled, *order)
-    assert misled.final is not None
-    assert honest.final is not None
-    assert encoded(misled.final) == encoded(honest.final)
+    boundary, misled = centre()
+    given(boundary, misled, *([*said, *forged] if behind else [*forged, *said]), end)
+    assert_final_of(misled, *said, end)
 
 
 def test_a_stranger_who_begins_a_stream_at_another_time_does_not_shut_its_source_out():
-    node = CentralNode(CentralConfig(), list(STREAMS))
-    boundary = Boundary("central")
-    given(boundary, node, (ch.START, "r1", FAR_START), *run())
+    boundary, node = centre()
+    given(boundary, node, (ch.START, "r1", build.initial_pose(stamp_ns=2**61)), *run())
     assert node.final is not None
     assert boundary.refused == 0
 
 
 def test_a_world_goes_on_when_others_took_what_a_stranger_has_published():
-    streams = world_of(*STREAMS.values())
-    announced = announce_configuration("world", 0, 0, RobotConfig("r1"))
-    node, boundary = WorldNode(streams, frozenset(), announced), Boundary("world")
-    here = build.liveliness(node="recorder")
-    given(boundary, node, (ch.ALIVE, "recorder", here))
+    boundary, node = world()
+    given(boundary, node, (ch.ALIVE, "recorder", build.liveliness(node="recorder")))
     while node.publish(0.0):
         pass
     published = len(MEASUREMENTS["r1"]) + len(MEASUREMENTS["r2"])

@@ -28,8 +28,8 @@ def claim(robot: str = "r2", incarnation: int = 1, last: int = 10**6) -> m.Holdi
     return build.holding(robot=robot, incarnation=incarnation, sequences=(0, last))
 
 
-def summary_of(*holdings: m.Holding, serial: int = 0, node: str = LIAR) -> m.SetSummary:
-    return build.set_summary(node=node, serial=serial, holdings=holdings)
+def summary_of(*holdings: m.Holding, serial: int = 0) -> m.SetSummary:
+    return build.set_summary(node=LIAR, serial=serial, holdings=holdings)
 
 
 def members_of(*keys: str, payload: bytes = b"x", signature: bytes = b"", node: str = LIAR):

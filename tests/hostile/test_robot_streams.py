@@ -35,16 +35,9 @@ PAIRS: tuple[tuple[Estimator, FusionRule], ...] = (
 
 def config(estimator: Estimator = "hybrid", fusion: FusionRule = "join", **fields) -> RobotConfig:
     front = {"particles": 10, "window_s": 10.0} | fields.pop("front_end", {})
-    return RobotConfig(
-        "r1",
-        motion=MotionModel(
-            forward=MotionNoise(per_s=0.03, per_m=0.04), turn=MotionNoise(per_s=0.02)
-        ),
-        front_end=FrontEnd(**front),
-        estimator=estimator,
-        fusion=fusion,
-        **fields,
-    )
+    noise = {"forward": MotionNoise(per_s=0.03, per_m=0.04), "turn": MotionNoise(per_s=0.02)}
+    method = {"estimator": estimator, "fusion": fusion, "front_end": FrontEnd(**front)}
+    return RobotConfig("r1", motion=MotionModel(**noise), **method, **fields)
 
 
 def drive(
@@ -60,10 +53,7 @@ def drive(
             stamp_ns=k * S, number=2 * k - 1, ids=seen, ranges=ranges, bearings=bearings
         )
         out += [look, (odd or {}).get(k) or own]
-    return [
-        *out,
-        build.end(steps * S, r1=2 * steps + 1),
-    ]
+    return [*out, build.end(steps * S, r1=2 * steps + 1)]
 
 
 def lived(messages, **fields) -> tuple[RobotNode, list[m.Submap], Counter[str]]:
@@ -121,15 +111,9 @@ def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bo
         if isinstance(each, m.Observations):
             k = each.number
             n = 2000 if k == 21 else 60
+            polar = {"ranges": np.linspace(1.0, 50.0, n), "bearings": np.linspace(-3.0, 3.0, n)}
             seen = np.arange(1, n + 1) + 60 * k
-            ranges = np.linspace(1.0, 50.0, n)
-            each = build.observations(
-                stamp_ns=each.stamp_ns,
-                number=k,
-                ids=seen,
-                ranges=ranges,
-                bearings=np.linspace(-3.0, 3.0, n),
-            )
+            each = build.observations(stamp_ns=each.stamp_ns, number=k, ids=seen, **polar)
         messages.append(each)
     bounds = Bounds(submap_landmarks=200)
     _, submaps, _ = lived(messages, bounds=bounds)
@@ -143,12 +127,7 @@ def test_thousands_of_landmarks_in_one_window_make_several_submaps_within_the_bo
 @settings(max_examples=SESSIONS, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32))
 def test_any_estimator_goes_on_through_a_hostile_stream(estimator, fusion, seed):
-    rng = np.random.default_rng(seed)
-    front = {
-        "node_s": 2.0 * (fusion == "join"),
-    }
-    node, out = robot_session(
-        hostile_stream(rng, "r1", 60), config(estimator, fusion, front_end=front)
-    )
+    own = config(estimator, fusion, front_end={"node_s": 2.0 * (fusion == "join")})
+    node, out = robot_session(hostile_stream(np.random.default_rng(seed), "r1", 60), own)
     assert any(isinstance(each.message, m.Done) for each in out), node.warnings
     assert not any("submap" in text for text in node.warnings if "withheld" in text)

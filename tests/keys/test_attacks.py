@@ -32,6 +32,8 @@ from tests.keys.certificates import TEAM, Folders
 from tests.support import example, examples, odometry, submap, wait_until
 
 HUGE = 2**62
+COUNTS = {"measurements": HUGE, "submaps": HUGE}
+OF_RECORDER = build.progress(node="recorder", **COUNTS)
 FINAL = example(m.FusedMap)
 CONCLUDED = example(m.Concluded, robot="r1")
 ATTACKS = {
@@ -39,30 +41,14 @@ ATTACKS = {
     "forges the final map": (ch.FINAL_MAP, "", FINAL),
     "begins one that nobody reaches": (ch.START, "r1", build.initial_pose(incarnation=HUGE)),
     "says that another is done": (ch.ROBOT_DONE, "r1", build.done(incarnation=HUGE)),
-    "frees another's credit": (
-        ch.ROBOT_PROGRESS,
-        "r1",
-        build.progress(measurements=HUGE, submaps=HUGE),
-    ),
-    "orders a withdrawal": (ch.ORDER, "r1", build.withdrawal(reason="so")),
-    "tells that the centre withdrew": (
-        ch.WITHDRAWAL,
-        "r1",
-        build.withdrawal(by="central", reason="so"),
-    ),
-    "lets another repeat it": (
-        ch.WITHDRAWALS_HEARD,
-        "r1",
-        build.withdrawal_heard(withdrawn="r1", reason="so"),
-    ),
+    "frees another's credit": (ch.ROBOT_PROGRESS, "r1", build.progress(**COUNTS)),
+    "orders a withdrawal": (ch.ORDER, "r1", build.withdrawal()),
+    "tells that the centre withdrew": (ch.WITHDRAWAL, "r1", build.withdrawal(by="central")),
+    "lets another repeat it": (ch.WITHDRAWALS_HEARD, "r1", build.withdrawal_heard(withdrawn="r1")),
     "brings a robot of its own": (ch.SUBMAP, "r9", submap(0, "r9")),
     "replaces a measurement": (ch.ODOMETRY, "r1", odometry(0, "r1")),
     "replaces a teammate's submap": (ch.SUBMAP, "r1", submap(0, "r1")),
-    "takes the recorder's place": (
-        ch.RECORDER_PROGRESS,
-        "r1",
-        build.progress(node="recorder", measurements=HUGE, submaps=HUGE),
-    ),
+    "takes the recorder's place": (ch.RECORDER_PROGRESS, "r1", OF_RECORDER),
     "gives the truth": (ch.TRUTH, "r1", example(m.Truth)),
 }
 """Messages of r2 in the names of others."""
@@ -77,9 +63,7 @@ def on_every_row() -> Iterator[Outgoing]:
             yield Outgoing(channel, name, said[channel.message])
 
 
-OWN = Outgoing(
-    ch.ROBOT_PROGRESS, "r2", build.progress(stamp_ns=7, robot="r2", measurements=1, submaps=1)
-)
+OWN = Outgoing(ch.ROBOT_PROGRESS, "r2", build.progress(robot="r2"))
 
 
 @contextmanager
@@ -158,10 +142,8 @@ def test_the_router_stores_a_robots_own_end_as_its_own_and_serves_it_as_nobody_e
         def stored() -> list[str]:
             names = tuple(channel.name for channel in ch.REPLIES[ch.KEPT])
             request = build.kept_request(channels=names, run_ns=3600 * 10**9)
-            return [
-                read_reply(ch.KEPT, "", each, 0).key
-                for each in victim.ask(ch.KEPT, "", request, 5.0)
-            ]
+            replies = victim.ask(ch.KEPT, "", request, 5.0)
+            return [read_reply(ch.KEPT, "", each, 0).key for each in replies]
 
         def ends(bus: ZenohBus, *channels: ch.Channel) -> list[Sample]:
             end = EndQuery(bus, "robot/r1", channels or (ch.FINAL_MAP,))
@@ -291,7 +273,7 @@ def test_each_side_names_a_certificate_that_it_refuses(keys, monkeypatch, capfd)
         told, took = refusal(endpoint, keys.strange)
         assert "the router's certificate is invalid" in told
         assert took < 30.0
-        told, took = refusal(endpoint, keys.strange, authority=keys.own / "ca.pem")
+        told, _ = refusal(endpoint, keys.strange, authority=keys.own / "ca.pem")
         assert "the router refuses" in told
         assert "of another authority" in told
         told, _ = refusal(endpoint, None)

@@ -55,12 +55,8 @@ def test_what_is_wrong_with_a_nodes_files_is_named_before_it_connects(keys, tmp_
     assert "robot-r1.key is not the key of" in told(other)
     other = mixed(keys, tmp_path, ca_pem=keys.strange / "ca.pem")
     assert "is not of the authority in" in told(other)
-    other = mixed(
-        keys,
-        tmp_path,
-        robot_r1_pem=keys.own / "robot-r2.pem",
-        robot_r1_key=keys.own / "robot-r2.key",
-    )
+    pair = {"robot_r1_pem": keys.own / "robot-r2.pem", "robot_r1_key": keys.own / "robot-r2.key"}
+    other = mixed(keys, tmp_path, **pair)
     assert "a certificate of 'robot-r2', not of robot-r1" in told(other)
     (tmp_path / "robot-r1.pem").write_text("nothing")
     assert "robot-r1.pem: no certificate in PEM" in told(tmp_path)

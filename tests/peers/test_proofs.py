@@ -30,13 +30,24 @@ def folder(tmp_path_factory):
     return made
 
 
+def signer_of(folder: Path, name: str, **options: object) -> Signer:
+    return Signer(credentials_of(folder, name, "t", **options))
+
+
+def peer_of(folder: Path, robot: str) -> PeerNode:
+    proofs = Proofs(robot, signer_of(folder, f"robot-{robot}"))
+    return PeerNode(ch.robot_node(robot), ROBOTS, proofs)
+
+
 @pytest.fixture(scope="module")
 def nodes(folder):
-    found = {}
-    for robot in ROBOTS:
-        signer = Signer(credentials_of(folder, f"robot-{robot}", "t"))
-        found[robot] = PeerNode(ch.robot_node(robot), ROBOTS, Proofs(robot, signer))
-    return found
+    return {robot: peer_of(folder, robot) for robot in ROBOTS}
+
+
+def batch_of(each: Member, signature: bytes) -> m.Members:
+    """The batch in which r2 carries a member."""
+    one = {"keys": (each.key,), "payloads": (each.payload,), "signatures": (signature,)}
+    return build.members(node="robot/r2", **one)
 
 
 def proofs_of(node: PeerNode) -> Proofs:
@@ -79,27 +90,17 @@ def test_what_is_signed_comes_over_a_third_robot_and_nothing_else_does(nodes):
 def test_a_signature_of_somebody_else_proves_nothing(nodes):
     forged = parcel("r1", 5)[0]
     signature = proofs_of(nodes["r2"])._signer.sign(forged.hash)
-    batch = build.members(
-        node="robot/r2", keys=(forged.key,), payloads=(forged.payload,), signatures=(signature,)
-    )
-    assert nodes["r3"].take_carried(batch) == []
+    assert nodes["r3"].take_carried(batch_of(forged, signature)) == []
     assert "not signed by r1" in nodes["r3"].last_refused
 
 
 def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(nodes, folder):
-    order = build.withdrawal(reason="broken")
-    said = member(ch.ORDER, order)
-    carrier = Signer(credentials_of(folder, "robot-r2", "t"))
-    batch = build.members(
-        node="robot/r2",
-        keys=(said.key,),
-        payloads=(said.payload,),
-        signatures=(sign_order(carrier, said).signature,),
-    )
-    assert nodes["r3"].take_carried(batch) == []
+    said = member(ch.ORDER, build.withdrawal(reason="broken"))
+    of_carrier = sign_order(signer_of(folder, "robot-r2"), said).signature
+    assert nodes["r3"].take_carried(batch_of(said, of_carrier)) == []
     assert "an order with a certificate of robot-r2" in nodes["r3"].last_refused
-    assert nodes["r3"].take_carried(msgspec.structs.replace(batch, signatures=(b"",))) == []
-    operator = Signer(credentials_of(folder, "operator", "t"))
+    assert nodes["r3"].take_carried(batch_of(said, b"")) == []
+    operator = signer_of(folder, "operator")
     nodes["r2"].take(said, "operator")
     proofs_of(nodes["r2"]).take_signature(sign_order(operator, said), OPERATOR)
     nodes["r3"].tick(20.0)
@@ -109,9 +110,7 @@ def test_an_order_comes_over_a_third_robot_with_an_operators_signature_only(node
 
 def test_a_certificate_of_another_robot_is_nobodys_proof(nodes):
     own = proofs_of(nodes["r2"]).certificate()
-    as_r1 = member(
-        ch.CERTIFICATE, m.Certificate(stamp_ns=0, robot="r1", certificate=own.certificate)
-    )
+    as_r1 = member(ch.CERTIFICATE, msgspec.structs.replace(own, robot="r1"))
     refused = proofs_of(nodes["r3"]).refusal(as_r1, nodes["r3"].replica)
     assert refused == "a certificate of robot-r2 of t, not of robot-r1 of t"
 
@@ -122,15 +121,11 @@ class Renewed:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         make_keys(folder, "t", nodes_of(ROBOTS))
-        self.r2, self.r3 = self.peer("r2"), self.peer("r3")
+        self.r2, self.r3 = peer_of(folder, "r2"), peer_of(folder, "r3")
         self.now_s = 100.0
 
-    def peer(self, robot: str) -> PeerNode:
-        signer = Signer(credentials_of(self.folder, f"robot-{robot}", "t"))
-        return PeerNode(ch.robot_node(robot), ROBOTS, Proofs(robot, signer))
-
     def own(self) -> Proofs:
-        return Proofs("r1", Signer(credentials_of(self.folder, "robot-r1", "t")))
+        return Proofs("r1", signer_of(self.folder, "robot-r1"))
 
     def say(self, proofs: Proofs, *members: Member) -> None:
         self.r2.take(member(ch.CERTIFICATE, proofs.certificate()), "robot/r1")
@@ -184,7 +179,7 @@ def test_a_roster_beside_the_own_key_names_who_is_revoked_without_a_successor(tm
     make_keys(tmp_path, "t", [], revoke=["robot-r1"])
     team.say(stolen, start("r1"), *parcel("r1", 0))
     assert team.submaps_of_r3() == 1, "its process was started before the revocation"
-    team.r3 = team.peer("r3")
+    team.r3 = peer_of(tmp_path, "r3")
     assert team.submaps_of_r3() == 0
     assert "revoked" in team.r3.last_refused
 
@@ -195,15 +190,11 @@ def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_i
     team = Renewed(tmp_path)
     make_keys(tmp_path, "t", [], renew=["robot-r1"], days=1.0, now=now - timedelta(days=2))
     then = now - timedelta(days=1.5)
-    old = Proofs("r1", Signer(credentials_of(tmp_path, "robot-r1", "t", now=then)))
+    old = Proofs("r1", signer_of(tmp_path, "robot-r1", now=then))
     day_ns = 86_400 * 10**9
+    now_ns = int(now.timestamp()) * 10**9
     late, early = (
-        msgspec.structs.replace(
-            start("r1").message,
-            incarnation=k,
-            stamp_ns=int(now.timestamp()) * 10**9 - k * day_ns // 2,
-        )
-        for k in (1, 3)
+        build.initial_pose(incarnation=k, stamp_ns=now_ns - k * day_ns // 2) for k in (1, 3)
     )
     team.say(old, member(ch.START, late), member(ch.START, early))
     team.submaps_of_r3()
@@ -214,7 +205,7 @@ def test_what_is_stamped_after_its_certificate_had_ended_is_refused_and_before_i
 def test_a_certificate_that_is_not_the_authoritys_takes_no_place_of_the_true_one(tmp_path):
     team = Renewed(tmp_path / "own")
     make_keys(tmp_path / "strange", "t", nodes_of(ROBOTS))
-    strange = Proofs("r1", Signer(credentials_of(tmp_path / "strange", "robot-r1", "t")))
+    strange = Proofs("r1", signer_of(tmp_path / "strange", "robot-r1"))
     forged = member(ch.CERTIFICATE, strange.certificate())
     assert not team.r2.take_sample(forged.as_sample(0), "robot/r1")
     assert "the team's authority has not issued" in team.r2.last_refused
@@ -226,28 +217,20 @@ def test_an_order_by_an_operators_key_that_is_revoked_is_refused_once_the_next_o
     tmp_path,
 ):
     team = Renewed(tmp_path)
-    stolen = Signer(credentials_of(tmp_path, "operator", "t"))
+    stolen = signer_of(tmp_path, "operator")
     make_keys(tmp_path, "t", [], revoke=["operator"])
     make_keys(tmp_path, "t", nodes_of(ROBOTS))
-    present = Signer(credentials_of(tmp_path, "operator", "t"))
+    present = signer_of(tmp_path, "operator")
 
     def carried(signer: Signer, robot: str, to: PeerNode, stamp_ns: int = 0) -> list[Member]:
-        order = build.withdrawal(stamp_ns=stamp_ns, robot=robot, reason="broken")
-        said = member(ch.ORDER, order)
-        return to.take_carried(
-            build.members(
-                node="robot/r2",
-                keys=(said.key,),
-                payloads=(said.payload,),
-                signatures=(sign_order(signer, said).signature,),
-            )
-        )
+        said = member(ch.ORDER, build.withdrawal(stamp_ns=stamp_ns, robot=robot))
+        return to.take_carried(batch_of(said, sign_order(signer, said).signature))
 
     assert carried(stolen, "r1", team.r3), "nothing that it has seen says otherwise"
     assert carried(present, "r2", team.r3)
     assert not carried(stolen, "r3", team.r3)
     assert "an operator's certificate that is revoked" in team.r3.last_refused
-    with_roster = team.peer("r3")
+    with_roster = peer_of(tmp_path, "r3")
     assert not carried(stolen, "r1", with_roster), "its roster says so from the beginning"
     assert not carried(present, "r1", with_roster, stamp_ns=2**62 - 1)
     assert "stamped after the operator's certificate had ended" in with_roster.last_refused
@@ -258,10 +241,8 @@ def test_a_robot_that_is_started_again_signs_its_stored_members_with_its_present
     said = [start("r1"), *parcel("r1", 0)]
     make_keys(tmp_path, "t", [], revoke=["robot-r1"])
     make_keys(tmp_path, "t", nodes_of(ROBOTS))
-    robot = PeerRobot(
-        RobotConfig("r1"), CentralConfig(), ROBOTS,
-        signer=Signer(credentials_of(tmp_path, "robot-r1", "t")),
-    )  # fmt: skip
+    signer = signer_of(tmp_path, "robot-r1")
+    robot = PeerRobot(RobotConfig("r1"), CentralConfig(), ROBOTS, signer=signer)
     robot.keep(Member(each.key, each.payload, each.message, b"of the key before") for each in said)
     signatures = [each.message for each in robot.begin() if isinstance(each.message, m.Signature)]
     own = team.own()

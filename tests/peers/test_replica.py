@@ -1,3 +1,5 @@
+import random
+
 import msgspec
 import pytest
 
@@ -18,7 +20,18 @@ from tests import build
 from tests.peers.teams import Storm, done, member, parcel, start
 from tests.support import example
 
-ROBOTS = ("r1", "r2")
+ROBOTS, THREE = ("r1", "r2"), ("r1", "r2", "r3")
+REQUEST = encoded(
+    build.members_request(node="robot/r2", requested=(build.requested(robot="r2", last=39),))
+)
+
+
+def node_with(name: str, submaps: int) -> PeerNode:
+    """A peer of three that has this part of r2's stream."""
+    node = PeerNode(name, THREE)
+    for each in (start("r2"), *(one for k in range(submaps) for one in parcel("r2", k))):
+        node.take(each, "robot/r2")
+    return node
 
 
 def replica_of(*members: Member, share: int = 2**20) -> Replica:
@@ -33,12 +46,7 @@ def digest_of(replica: Replica) -> bytes:
 
 
 def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there():
-    node, honest = (
-        PeerNode("robot/r1", ("r1", "r2", "r3")),
-        PeerNode("robot/r2", ("r1", "r2", "r3")),
-    )
-    for each in (start("r2"), *(m_ for k in range(4) for m_ in parcel("r2", k))):
-        honest.take(each, "robot/r2")
+    node, honest = PeerNode("robot/r1", THREE), node_with("robot/r2", 4)
     claim = build.holding(robot="r2", sequences=(0, 2_000_000))
     lie = build.set_summary(node="robot/r3", holdings=(claim,) * 3)
     asked: list[str] = []
@@ -60,40 +68,32 @@ def test_who_claims_millions_of_submaps_keeps_nobody_from_what_is_there():
 
 
 def test_questions_without_end_are_given_so_many_bytes_a_second():
-    node = PeerNode("robot/r1", ("r1", "r2"))
-    for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
-        node.take(each, "robot/r2")
-    want = build.requested(robot="r2", last=39)
-    request = encoded(build.members_request(node="robot/r2", requested=(want,)))
-    one = sum(map(len, node.answer(request)))
+    node = node_with("robot/r1", 40)
+    one = sum(map(len, node.answer(REQUEST)))
     node._given_bytes += GIVEN_BYTES
     assert one > 0
-    assert node.answer(request) == []
+    assert node.answer(REQUEST) == []
     node.tick(2.0)
-    assert sum(map(len, node.answer(request))) == one
+    assert sum(map(len, node.answer(REQUEST))) == one
 
 
 def test_questions_in_another_nodes_name_take_nothing_from_that_node():
     """Names in requests are not proven: r3's requests as r2 do not count against r2."""
-    node = PeerNode("robot/r1", ("r1", "r2", "r3"))
-    for each in (start("r2"), *(m_ for k in range(40) for m_ in parcel("r2", k))):
-        node.take(each, "robot/r2")
-    want = build.requested(robot="r2", last=39)
-    request = encoded(build.members_request(node="robot/r2", requested=(want,)))
+    node = node_with("robot/r1", 40)
     while node._given_bytes < GIVEN_BYTES // 4:  # more than a node is sent in a second
-        assert node.answer(request)
+        assert node.answer(REQUEST)
         node._given_bytes += GIVEN_BYTES // 16
-    assert node.answer(request)
+    assert node.answer(REQUEST)
 
 
 def test_a_conclusion_of_a_serial_without_bound_is_refused_and_the_own_next_one_is_valid():
-    replica = Replica(("r1", "r2"))
+    replica = Replica(ROBOTS)
     last = build.concluded(serial=2**63 - 1)
     with pytest.raises(RefusedError, match="no peer has more than"):
         replica.add(member(ch.CONCLUDED, last))
-    node = PeerNode("robot/r1", ("r1", "r2"))
+    node = PeerNode("robot/r1", ROBOTS)
     node.take(member(ch.CONCLUDED, msgspec.structs.replace(last, serial=MOST_COUNT)), "robot/r1")
-    fold = PeerFold(CentralConfig(), ("r1", "r2"), node)
+    fold = PeerFold(CentralConfig(), ROBOTS, node)
     fold.final = example(m.FusedMap)
     concluded = fold.conclusion("r1")
     assert concluded is not None
@@ -177,7 +177,6 @@ def test_verdicts_are_members_each_of_its_own_and_so_is_that_one_is_withdrawn():
     assert make_request(replica_of(*told[:2]), one.summary("n", 0, 0)) is not None
 
 
-ROBOTS_END = ("r1", "r2", "r3")
 ORDERS = {
     "given up": (ch.GIVEN_UP, build.given_up(node="robot/r3", reason="lost")),
     "withdrawn": (ch.ORDER, build.withdrawal(robot="r3", reason="broken")),
@@ -185,13 +184,12 @@ ORDERS = {
 
 
 def ended(robot: str) -> Sample:
-    concluded = build.concluded(robot=robot, serial=1)
-    return Sample(ch.CONCLUDED.key(robot), encoded(concluded), 0, 0, 0)
+    return member(ch.CONCLUDED, build.concluded(robot=robot, serial=1)).as_sample(0)
 
 
 @pytest.fixture
 def peer():
-    return PeerRobot(RobotConfig("r2"), CentralConfig(), ROBOTS_END)
+    return PeerRobot(RobotConfig("r2"), CentralConfig(), THREE)
 
 
 def test_the_end_of_one_robot_is_not_the_end_of_the_team(peer):
@@ -233,3 +231,65 @@ def test_without_questions_a_schedule_ends_with_different_sets():
     storm.spread = lambda name, out: None
     storm.run()
     assert len({storm.digest(name) for name in storm.names}) > 1
+
+
+# The fold of a set.
+
+
+END = build.end(**dict.fromkeys(ROBOTS, 20))
+ORDER = member(ch.ORDER, build.withdrawal(robot="r2", reason="broken"))
+NOT_SEEN = build.given_up(node="robot/r2", reason="not seen")
+GIVEN_UP = Member(ch.GIVEN_UP.key("robot/r2"), encoded(NOT_SEEN), NOT_SEEN)
+
+
+def folded(batches: list[list[Member]], ends_after: int) -> m.FusedMap:
+    node = PeerNode("robot/r1", ROBOTS)
+    fold = PeerFold(CentralConfig(), ROBOTS, node)
+    for k, batch in enumerate([*batches, []]):
+        if k == ends_after:
+            fold.note(END)
+        for each in batch:
+            node.take(each, "robot/r2")
+        fold.grow()
+    assert fold.final is not None
+    return fold.final
+
+
+@pytest.mark.parametrize(
+    ("extra", "withdrawn"),
+    [([ORDER], ("r2",)), ([GIVEN_UP], ()), ([ORDER, GIVEN_UP], ("r2",))],
+    ids=["withdrawn", "given up and back", "both"],
+)
+def test_orders_are_in_the_final_map_whatever_came_with_the_last_of_a_stream(extra, withdrawn):
+    """The robot is the last by name: its `Done` precedes the order."""
+    members = [
+        each
+        for robot in ROBOTS
+        for each in (start(robot), *parcel(robot, 0), *parcel(robot, 1), done(robot, 2))
+    ]
+    members += extra
+    rng = random.Random(1)
+    found = set()
+    for _ in range(12):
+        order = rng.sample(members, len(members))
+        cuts = sorted(rng.sample(range(len(members) + 1), rng.randrange(4)))
+        batches = [order[a:b] for a, b in zip([0, *cuts], [*cuts, len(order)], strict=True)]
+        final = folded(batches, rng.randrange(len(batches) + 1))
+        assert (final.withdrawn, final.lost) == (withdrawn, ())
+        found.add(encoded(final))
+    assert len(found) == 1
+
+
+def test_a_fold_is_given_submaps_in_the_order_of_time():
+    """Order by robots would restart the fold and cost three times as much."""
+    node = PeerNode("robot/r1", ROBOTS)
+    for robot in reversed(ROBOTS):
+        for each in (done(robot, 3), *parcel(robot, 2), *parcel(robot, 1), *parcel(robot, 0)):
+            node.take(each, "robot/r2")
+        node.take(start(robot), "robot/r2")
+    given = list(node.new_messages())
+    submaps = [each for each in given if isinstance(each, m.Submap)]
+    assert [each.robot for each in submaps] == ["r1", "r2"] * 3
+    assert [each.stamp_ns for each in submaps] == sorted(each.stamp_ns for each in submaps)
+    assert all(isinstance(each, m.InitialPose) for each in given[:2])
+    assert all(isinstance(each, m.Done) for each in given[-2:])

@@ -21,11 +21,10 @@ from tests.peers.teams import said
 MEMBERS = [each for occasion in said("r1", 4, "r2") for each in occasion]
 
 
-def kept_in(path: Path, content: bytes) -> int:
-    path.write_bytes(content)
+def opened_and_closed(path: Path) -> SetFile:
     store = SetFile(path)
     store.close()
-    return len(store.members)
+    return store
 
 
 def test_what_was_appended_is_there_again_and_goes_on(tmp_path):
@@ -38,9 +37,7 @@ def test_what_was_appended_is_there_again_and_goes_on(tmp_path):
     again.append(MEMBERS[3:])
     again.close()
     found = Replica(["r1", "r2"])
-    last = SetFile(path)
-    last.close()
-    for each in last.members:
+    for each in opened_and_closed(path).members:
         found.add(each)
     assert found.submaps == 4
 
@@ -61,8 +58,7 @@ def check_recovered(path: Path, content: bytes, lost: set[int]) -> SetFile:
     assert store.members == [each for k, each in enumerate(MEMBERS) if k not in lost]
     store.append([MEMBERS[0]])
     store.close()
-    again = SetFile(path)
-    again.close()
+    again = opened_and_closed(path)
     assert again.members == [*store.members, MEMBERS[0]]
     assert not again.lost
     assert not again.torn
@@ -74,8 +70,7 @@ def test_truncated_at_any_byte_a_set_has_every_whole_record(tmp_path):
         cut = max(sum(end <= size for end in ENDS) - 1, 0)
         path = tmp_path / "set"
         path.write_bytes(WHOLE[:size])
-        store = SetFile(path)
-        store.close()
+        store = opened_and_closed(path)
         assert store.members == MEMBERS[:cut]
         if size % 20 == 0:
             check_recovered(path, WHOLE[:size], set(range(cut, 99)))
@@ -101,9 +96,7 @@ def test_what_is_known_to_be_lost_is_named_by_its_number(tmp_path, caplog):
     damaged[ENDS[submaps[1]] + 30] ^= 4
     path = tmp_path / "r1.set"
     path.write_bytes(bytes(damaged))
-    store = SetFile(path)
-    (warning,) = store.warnings
-    store.close()
+    (warning,) = opened_and_closed(path).warnings
     missing = MEMBERS[submaps[1]].message
     assert isinstance(missing, m.Submap)
     size = len(RECORDS[submaps[1]])
@@ -122,9 +115,7 @@ def test_a_record_within_a_damaged_one_is_not_taken(tmp_path):
     outer[8 + 3] ^= 1
     path = tmp_path / "r1.set"
     path.write_bytes(MAGIC + bytes(outer) + RECORDS[0])
-    store = SetFile(path)
-    store.close()
-    assert store.members == [MEMBERS[0]]
+    assert opened_and_closed(path).members == [MEMBERS[0]]
 
 
 def test_a_write_that_is_cut_short_is_finished_or_taken_back(tmp_path, monkeypatch, caplog):
@@ -148,16 +139,14 @@ def test_a_write_that_is_cut_short_is_finished_or_taken_back(tmp_path, monkeypat
     assert "No space left on device" in warning
     assert "members are not stored" in warning
     assert caplog.text.count("the set is not stored") == 1
-    whole = kept_in(path, path.read_bytes())
+    whole = len(opened_and_closed(path).members)
     assert 0 < whole < 50
     room = 10**9
     for each in several[50:]:
         store.append([each])
     assert not store.warnings
     store.close()
-    again = SetFile(path)
-    again.close()
-    assert again.members == several
+    assert opened_and_closed(path).members == several
 
 
 def test_another_file_is_not_overwritten(tmp_path):

@@ -16,10 +16,10 @@ PACE = "5"
 """Ten seconds are left after r1's first submap: what is to be met alive still runs by then."""
 
 
-async def launched(team: Processes, speed: str = PACE) -> tuple[Process, Path]:
+async def launched(team: Processes, speed: str = PACE, *options: str) -> tuple[Process, Path]:
     folder = team.folder / "run"
     launch = await team.start(
-        *("launch", short(team.folder), "--speed", speed, "--no-report"),
+        *("launch", short(team.folder), "--speed", speed, "--no-report", *options),
         *("--output", folder, "--json", "result.json"),
     )
     with Observer(await endpoint_of(folder), [ch.SUBMAP]) as seen:
@@ -35,7 +35,7 @@ def submaps_in(log: Path) -> int:
 
 
 async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team):
-    launch, folder = await launched(team, "4")
+    launch, _ = await launched(team, "4")
     killed = []
     for name, *words in (
         ("robot-r1", "robot", "r1"), ("central", "central"), ("recorder", "record"),
@@ -54,10 +54,13 @@ async def test_whoever_is_killed_is_started_again_and_the_map_is_the_same(team):
     assert result["failures"] == []
     assert set(result["restarts"].values()) == {1}
     assert len(result["restarts"]) == len(killed)
-    samples = open_log(folder / "log.mcap").samples([ch.FINAL_MAP])
-    assert final_map([(s.key, s.payload) for s in samples]) == map_in_memory(
-        team.folder / "short.toml"
-    )
+    assert_map_is_undisturbed(team)
+
+
+def assert_map_is_undisturbed(team: Processes) -> None:
+    samples = open_log(team.folder / "run" / "log.mcap").samples([ch.FINAL_MAP])
+    found = final_map([(each.key, each.payload) for each in samples])
+    assert found == map_in_memory(team.folder / "short.toml")
 
 
 def standing(pid: int) -> tuple[int, int, int]:
@@ -112,23 +115,14 @@ async def test_a_robot_that_dies_again_and_again_is_given_up_by_name_and_the_map
 
 
 async def test_a_stopped_process_is_named_and_is_ended_and_started_again_if_that_is_wished(team):
-    folder = team.folder / "run"
-    launch = await team.start(
-        *("launch", short(team.folder), "--speed", PACE, "--no-report", "--end-silent", "11"),
-        *("--output", folder, "--json", "result.json"),
-    )
-    with Observer(await endpoint_of(folder), [ch.SUBMAP]) as seen:
-        await seen.sees(1, ch.SUBMAP, "r1")
+    launch, _ = await launched(team, PACE, "--end-silent", "11")
     pid = await team.pid("world")
     os.kill(pid, signal.SIGSTOP)
     assert await launch.ended() == 0, launch.said()
     await team.none_left(0.0)
     assert f"world (pid {pid}) is stopped (SIGSTOP?) and has sent no message for" in launch.said()
     assert json.loads((team.folder / "result.json").read_text())["restarts"] == {"world": 1}
-    samples = open_log(folder / "log.mcap").samples([ch.FINAL_MAP])
-    assert final_map([(s.key, s.payload) for s in samples]) == map_in_memory(
-        team.folder / "short.toml"
-    )
+    assert_map_is_undisturbed(team)
 
 
 async def test_an_interrupt_ends_every_process_and_completes_the_log(team):

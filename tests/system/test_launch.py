@@ -9,6 +9,7 @@ import msgspec
 import pytest
 import pytest_asyncio
 
+from teamslam.central.desk.verification.verification import verify
 from teamslam.central.main import StoredSet
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.roster import nodes_of
@@ -18,19 +19,12 @@ from teamslam.team.wire.arrays import floats, from_floats
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.messages import Configuration, Submap
+from tests.central.desk.test_evaluation import FIGURES, ROBOT_FIGURES
 from tests.system.conftest import Launched
 from tests.system.processes import Processes, Terminal
 from tests.system.scenarios import STEPS, final_map, map_in_memory, sha256, short
 
 COMMAND = Path(sys.executable).with_name("teamslam")
-FIGURES = (
-    "landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof", "joint_cost_per_dof",
-    "landmarks", "final_map_digest", "log", "wall_s",
-)  # fmt: skip
-ROBOT_FIGURES = (
-    "steps", "measurements_published", "measurements_consumed", "position_rmse_m",
-    "heading_rmse_rad", "pose_nees_per_dof", "uplink_bytes", "submaps",
-)  # fmt: skip
 
 
 def test_a_launch_ends_by_itself_with_every_process_at_status_zero(launched):
@@ -94,14 +88,14 @@ def test_processes_and_a_team_in_memory_send_the_same_bytes_as_final_map(launche
     assert launched.result["final_map_sha256"] == sha256(payload)
 
 
-async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, object]:
+async def launch(team: Processes, scenario: Path, *options: str) -> dict[str, Any]:
     process = await team.start(
         *("launch", scenario, "--speed", "max", "--no-report", "--no-views", "--output", "run"),
         *("--json", "result.json", *options),
     )
     assert await process.ended() == 0, process.said()
     await team.none_left(0.0)
-    result: dict[str, object] = json.loads((team.folder / "result.json").read_text())
+    result: dict[str, Any] = json.loads((team.folder / "result.json").read_text())
     return result
 
 
@@ -113,6 +107,21 @@ async def test_a_comparison_pair_ends_with_the_bytes_of_a_team_in_memory(team):
     result = await launch(team, scenario, "--seed", "2")
     assert (result["estimator"], result["fusion"], result["seed"]) == (*pair, 2)
     assert result["final_map_sha256"] == sha256(map_in_memory(scenario, seed=2))
+
+
+async def test_without_a_centre_every_robots_final_map_is_that_of_a_central_run(team):
+    scenario = short(team.folder, steps=40)
+    result = await launch(team, scenario, "--without-centre")
+    assert "central" not in result["processes"]
+    expected = sha256(map_in_memory(scenario))
+    peers = result["peers"]
+    hashes = {name: peer["final_map_sha256"] for name, peer in peers.items()}
+    assert hashes == dict.fromkeys(["r1", "r2"], expected)
+    assert result["final_map_sha256"] == expected
+    assert all(peer["uplink_bytes"] and peer["downlink_bytes"] for peer in peers.values())
+    log = verify(open_log(team.folder / "run" / "log.mcap"))
+    assert log.first is None
+    assert {"team_map", "team_final"} <= {channel.channel for channel in log.channels}
 
 
 @dataclass(frozen=True)

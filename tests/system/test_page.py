@@ -333,8 +333,7 @@ CONTRASTS = """
 @pytest.mark.parametrize("scheme", ["dark", "light"])
 def test_every_text_stands_out_from_its_ground(page, scheme):
     page.call(
-        "Emulation.setEmulatedMedia",
-        features=[{"name": "prefers-color-scheme", "value": scheme}],
+        "Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}]
     )
     seek(page, 30)  # later events are grey
     ratios = page.ask(CONTRASTS)

@@ -56,10 +56,7 @@ async def robot(team: Processes, found: Team, endpoint: str, name: str) -> Proce
 
 async def test_measurements_that_a_cut_link_loses_are_asked_for_at_their_source(team):
     found = await assembled(team, "10")
-    with (
-        Link(found.endpoint) as link,
-        Observer(found.endpoint, [ch.ODOMETRY, ch.END]) as seen,
-    ):
+    with Link(found.endpoint) as link, Observer(found.endpoint, [ch.ODOMETRY, ch.END]) as seen:
         found.robots["r1"] = await robot(team, found, link.endpoint, "r1")
         await seen.sees(STEPS // 4, ch.ODOMETRY, "r1")  # of the world, at any speed of r1
         link.cut()

@@ -20,8 +20,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
-
 from teamslam.central.node import CentralNode
 from teamslam.central.peers.fold import FoldWhen
 from teamslam.central.peers.peer import CENTRE
@@ -38,6 +36,7 @@ from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.air import Air
 from tests.peer_team import PeerTeam, peer_world
+from tests.scenarios import with_world
 
 SECOND = 10**9
 DEATHS = 30
@@ -54,8 +53,7 @@ def scenario_of(case: str, utias: Path) -> Scenario:
     if length:
         whole = scenario_of(case, utias)
         which = "steps" if hasattr(whole.world, "steps") else "duration_s"
-        shorter = msgspec.structs.replace(whole.world, **{which: int(length)})
-        return msgspec.structs.replace(whole, world=shorter)
+        return with_world(whole, **{which: int(length)})
     if case.startswith("utias-"):
         path = utias / f"MRCLAM_Dataset{case.removeprefix('utias-')}.zip"
         return with_options(load("utias"), dataset=path)
@@ -208,7 +206,7 @@ def outcome(case: str, way: str, scenario: Scenario, expected: bytes, *, withdra
 
 def storms(case: str, ways: list[str], utias: Path) -> Iterator[dict[str, object]]:
     name, _, kind = case.partition("/")
-    scenario = msgspec.structs.replace(scenario_of(name, utias))
+    scenario = scenario_of(name, utias)
     samples = list(run_team(scenario, streams_of(scenario)))
     submaps = {s.payload for s in samples if (ch.channel_of(s.key) or ("",))[0] is ch.SUBMAP}
     withdrawn = kind == "withdrawn"

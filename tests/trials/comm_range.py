@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +20,6 @@ import matplotlib.pyplot as plt
 
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -29,6 +27,7 @@ from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.codec import decoded
 from tests.air import air_of
 from tests.peer_team import PeerTeam, peer_world
+from tests.scenarios import with_world
 
 EVERY_S = 5.0
 Rows = dict[str, list[float]]
@@ -36,9 +35,7 @@ Rows = dict[str, list[float]]
 
 def measured(range_m: float | None, steps: int) -> Rows:
     scenario = with_options(load("random-10"), centre=False, comm_range_m=range_m)
-    world = scenario.world
-    assert isinstance(world, SimulatedWorld)
-    scenario = msgspec.structs.replace(scenario, world=msgspec.structs.replace(world, steps=steps))
+    scenario = with_world(scenario, steps=steps)
     streams = streams_of(scenario)
     assert streams.landmarks is not None
     where = dict(zip(streams.landmark_ids.tolist(), streams.landmarks, strict=True))

@@ -9,7 +9,6 @@ with 0, with this map, and without a hole that `teamslam log check` misses.
 """
 
 import argparse
-import json
 import os
 import random
 import shutil
@@ -19,12 +18,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from teamslam.sim.scenarios.scenario import load
 from tests.namespaces import NET, ip, network
-from tests.trials.kills import PROGRAM, await_text, expected_of, final_in, lacking, shortened
+from tests.trials.kills import (
+    PROGRAM,
+    Run,
+    await_text,
+    complaint,
+    expected_of,
+    final_in,
+    lacking,
+    play_missing,
+    shortened,
+)
 
 PORT = 7447
 ROUTER = f"tcp/{NET}.1:{PORT}"
@@ -33,33 +42,19 @@ Commands = Mapping[str, Sequence[str]]
 
 
 @dataclass
-class Run:
-    number: int
+class Cuts(Run):
     cuts: list[tuple[float, str, float]] = field(default_factory=list)
     exits: dict[str, int] = field(default_factory=dict)
-    wall_s: float = 0.0
-    equal: bool = False
-    check: str = ""
-    lacks: list[str] = field(default_factory=list)
 
     @property
     def good(self) -> bool:
         """Whether the run equals an undisturbed one."""
-        unnamed = bool(self.lacks) and not self.check
-        return self.equal and not unnamed and not any(self.exits.values())
+        return super().good and not any(self.exits.values())
 
     def __str__(self) -> str:
         cuts = ", ".join(f"{node} at {at:.1f} for {for_s:g}" for at, node, for_s in self.cuts)
         wrong = {node: status for node, status in self.exits.items() if status}
-        words = [
-            f"{self.number:3} {'good' if self.good else 'BAD '} {self.wall_s:5.1f} s",
-            "map equal" if self.equal else "MAP DIFFERS",
-            f"cut {cuts or 'nobody'}",
-            *([f"exits {wrong}"] if wrong else []),
-            *([f"log lacks {', '.join(self.lacks)}"] if self.lacks else []),
-            *([f"check: {self.check.splitlines()[0][:120]}"] if self.check else []),
-        ]
-        return "; ".join(words)
+        return self.words(f"cut {cuts or 'nobody'}", f"exits {wrong}" if wrong else "")
 
 
 class Team:
@@ -115,7 +110,7 @@ def link_of(node: str) -> str:
     return node.replace("driver", "d")
 
 
-def disturb(run: Run, team: Team, options: argparse.Namespace) -> None:
+def disturb(run: Cuts, team: Team, options: argparse.Namespace) -> None:
     rng = random.Random(f"{options.seed} {run.number}")
     moments = sorted(rng.uniform(0.0, options.span) for _ in range(options.cuts))
     nodes = [node for node in team.started if node != "router"]
@@ -141,8 +136,8 @@ def disturb(run: Run, team: Team, options: argparse.Namespace) -> None:
 
 def play(
     number: int, folder: Path, told: Commands, expected: bytes, options: argparse.Namespace
-) -> Run:
-    run = Run(number)
+) -> Cuts:
+    run = Cuts(number)
     (folder / "run").mkdir()
     with network([link_of(node) for node in told]) as names:
         team = Team(folder, told, names)
@@ -154,27 +149,18 @@ def play(
         finally:
             run.exits = team.stop()
     run.equal = final_in(folder) == expected
-    run.lacks = lacking(folder)
-    checked = subprocess.run(
-        [*PROGRAM, "log", "check", "run/log.mcap"],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
+    run.check, run.lacks = complaint(folder), lacking(folder)
     if not run.good and options.keep:
         shutil.copytree(folder, Path(options.keep) / f"run{number}", dirs_exist_ok=True)
     return run
 
 
-def play_all(one: Callable[[int, Path], Run], options: argparse.Namespace) -> int:
-    runs = []
-    if options.json and options.json.exists():
-        runs = [Run(**row) for row in json.loads(options.json.read_text())]
-    for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
+def play_all(one: Callable[[int, Path], Cuts], options: argparse.Namespace) -> int:
+    def play(number: int) -> Cuts:
         with tempfile.TemporaryDirectory() as place:
-            runs.append(one(number, Path(place).resolve()))
-        print(runs[-1], flush=True)
-        if options.json:
-            options.json.write_text(json.dumps([asdict(run) for run in runs]))
+            return one(number, Path(place).resolve())
+
+    runs = play_missing(Cuts, options, play)
     good = sum(run.good for run in runs)
     print(
         f"{good} of {len(runs)} runs good, {sum(len(r.cuts) for r in runs)} links cut; map equal "

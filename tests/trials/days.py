@@ -12,19 +12,17 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
-from teamslam.central.node import CentralNode, make_centre
-from teamslam.sim.in_memory.team import final_map, run_team
-from teamslam.sim.scenarios.scenario import load
+from teamslam.sim.in_memory.team import final_map
+from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.team.core import unpacked
-from teamslam.team.estimation.map_joining.alignment import Maps, align, procrustes
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
+from tests.central.test_saved_map import aligned_errors, covariance_of, day
+from tests.scenarios import with_world
 
 LANDMARKS, SITE_M = 40, 100.0
 CHANGED, MOVED_M = 0.05, 2.0
@@ -75,30 +73,21 @@ class Site:
 
 
 def run_days(count: int, seed: int) -> Iterator[Day]:
-    site, saved = Site(seed), None
+    site, maps = Site(seed), list[m.SavedMap]()
     pending: dict[int, str] = {}
-    for day in range(count):
-        pending |= site.change() if day else {}
-        scenario = msgspec.structs.replace(load("thesis-b"), seed=seed + 1000 * day)
-        world = msgspec.structs.replace(
-            scenario.world,
-            landmarks=tuple(site.places),
-            unknown_starts=("*",) if day else (),
-            paths=(),
+    for number in range(count):
+        pending |= site.change() if number else {}
+        scenario = with_options(load("thesis-b"), seed=seed + 1000 * number)
+        unknown = ("*",) if number else ()
+        scenario = with_world(
+            scenario, landmarks=tuple(site.places), unknown_starts=unknown, paths=()
         )
-        scenario = msgspec.structs.replace(scenario, world=world)
-        centres: list[CentralNode] = []
-
-        def central(config, names, centres=centres, saved=saved) -> CentralNode:
-            centres.append(make_centre(config, names, maps=() if saved is None else (saved,)))
-            return centres[-1]
-
         begin = time.process_time()
-        streams = streams_of(scenario)
-        samples = list(run_team(scenario, streams, central=central))
+        samples, centre, _ = day(0, maps, scenario=scenario, streams=streams_of(scenario))
         fused = final_map(samples)
         spent = time.process_time() - begin
-        saved = centres[0].maps.fold.save_map(f"day{day + 1}")
+        saved = centre.maps.fold.save_map(f"day{number + 1}")
+        maps = [saved]
         messages = (opened(sample)[2] for sample in samples)
         seen = {k for x in messages if isinstance(x, m.Submap) for k in ids(x.ids, "ids").tolist()}
         told = {each.landmark: each.state for each in fused.changes if each.state != "unchanged"}
@@ -121,13 +110,9 @@ def _figures(
     known = np.array([k not in pending and places[k - 1, 0] > AWAY[0] for k in numbers.tolist()])
     truth, rows = places[numbers - 1][known], np.repeat(known, 2)
     means = floats(saved.means, "means").reshape(-1, 2)[known]
-    P = unpacked(floats(saved.covariance, "covariance"), len(rows))[np.ix_(rows, rows)]
-    fit = align(Maps(truth, 1e-12 * np.eye(len(P)), means, P))
-    x, y, turn = procrustes(truth, means, np.ones(len(truth)))
-    s, c = np.sin(turn), np.cos(turn)
-    off = truth - means @ np.array([[c, s], [-s, c]]) - [x, y]
-    rmse = float(np.sqrt((off**2).sum(axis=1).mean()))
-    return Day(len(numbers), len(encoded(saved)), cpu_s, rmse, fit.chi2 / fit.dof, *counts)
+    P = covariance_of(saved)[np.ix_(rows, rows)]
+    errors = aligned_errors(truth, means, P)
+    return Day(len(numbers), len(encoded(saved)), cpu_s, *errors, *counts)
 
 
 def draw(days: list[Day], path: Path) -> None:
@@ -164,11 +149,11 @@ def main() -> None:
     options = parser.parse_args()
     print("day  landmarks  bytes  CPU [s]  RMSE [m]  NEES  changed  found  missed  false")
     days = []
-    for number, day in enumerate(run_days(options.days, options.seed), 1):
-        days.append(day)
+    for number, one in enumerate(run_days(options.days, options.seed), 1):
+        days.append(one)
         print(
-            f"{number:3d}  {day.landmarks:9d} {day.bytes:6d} {day.cpu_s:8.1f} {day.rmse_m:9.3f} "
-            f"{day.nees:5.2f} {day.changed:8d} {day.found:6d} {day.missed:7d} {day.false:6d}",
+            f"{number:3d}  {one.landmarks:9d} {one.bytes:6d} {one.cpu_s:8.1f} {one.rmse_m:9.3f} "
+            f"{one.nees:5.2f} {one.changed:8d} {one.found:6d} {one.missed:7d} {one.false:6d}",
             flush=True,
         )
     print(

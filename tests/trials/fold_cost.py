@@ -13,19 +13,17 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-import msgspec
-
 from teamslam.central.peers.fold import FoldWhen, PeerFold
 from teamslam.central.peers.robot import PeerRobot
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
-from teamslam.sim.world.config import SimulatedWorld
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 from tests.air import Air
 from tests.peer_team import PeerTeam, peer_world
+from tests.scenarios import with_world
 
 T = TypeVar("T")
 
@@ -76,10 +74,7 @@ class Timed(PeerRobot):
 
 
 def measured(name: str, steps: int) -> dict[str, Any]:
-    scenario = with_options(load(name), centre=False)
-    world = scenario.world
-    assert isinstance(world, SimulatedWorld)
-    scenario = msgspec.structs.replace(scenario, world=msgspec.structs.replace(world, steps=steps))
+    scenario = with_world(with_options(load(name), centre=False), steps=steps)
     ways: dict[str, FoldWhen] = {each.id: "end" for each in scenario.robots}
     first, second = (each.id for each in scenario.robots[:2])
     ways |= {first: "always", second: "request"}

@@ -27,9 +27,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from teamslam.sim.in_memory.team import run_team
 from teamslam.sim.scenarios.scenario import Scenario, load, with_options
@@ -51,26 +53,60 @@ GAVE_UP = re.compile(r"(\S+) \(pid \d+\) ended with exit status \d+")
 
 @dataclass
 class Run:
+    """The part that all trials with processes judge.
+
+    lacks: what the log lacks. check: the complaint of `teamslam log check`.
+    """
+
     number: int
-    hit: list[tuple[float, str]] = field(default_factory=list)
-    exit: int | None = None
     wall_s: float = 0.0
     equal: bool = False
+    check: str = ""
+    lacks: list[str] = field(default_factory=list)
+
+    @property
+    def good(self) -> bool:
+        """Whether the run equals an undisturbed one."""
+        return self.equal and not (self.lacks and not self.check)
+
+    def words(self, *more: str) -> str:
+        """Describe the run in a line; more: what only this trial has."""
+        words = [
+            f"{self.number:3} {'good' if self.good else 'BAD '} {self.wall_s:5.1f} s",
+            "map equal" if self.equal else "MAP DIFFERS",
+            *(each for each in more if each),
+            *([f"log lacks {', '.join(self.lacks)}"] if self.lacks else []),
+            *([f"check: {self.check.splitlines()[0][:120]}"] if self.check else []),
+        ]
+        return "; ".join(words)
+
+
+@dataclass
+class Kills(Run):
+    hit: list[tuple[float, str]] = field(default_factory=list)
+    exit: int | None = None
     left: int = 0
     gave_up: list[str] = field(default_factory=list)
-    check: str = ""
     verified: bool | None = None
-    lacks: list[str] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
 
     @property
     def good(self) -> bool:
         """Whether the run equals an undisturbed one."""
-        unnamed = bool(self.lacks) and not self.check
-        sound = self.verified in (None, True)
-        ended = self.left or self.gave_up
-        return self.exit == 0 and self.equal and not ended and not unnamed and sound
+        ended = self.exit == 0 and not self.left and not self.gave_up
+        return super().good and ended and self.verified is not False
+
+    def __str__(self) -> str:
+        what = ", ".join(f"{who} at {at:.1f}" for at, who in self.hit)
+        return self.words(
+            f"exit {'–' if self.exit is None else self.exit}",
+            f"hit {what or 'nobody'}",
+            f"{self.left} LEFT" if self.left else "",
+            f"GAVE UP: {', '.join(self.gave_up)}" if self.gave_up else "",
+            "NOT VERIFIED" if self.verified is False else "",
+            f"failures: {self.failures[0][:160]!r}" if self.failures else "",
+        )
 
 
 def children(launch: int, folder: Path) -> dict[int, list[str]]:
@@ -83,6 +119,15 @@ def children(launch: int, folder: Path) -> dict[int, list[str]]:
                     if "teamslam" in line:
                         found[int(entry.name)] = line[line.index("teamslam") + 1 :]
     return found
+
+
+def complaint(folder: Path) -> str:
+    """Complaint of `teamslam log check` about the log; empty: none."""
+    checked = subprocess.run(
+        [*PROGRAM, "log", "check", "run/log.mcap"],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    return "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
 
 
 def lacking(folder: Path) -> list[str]:
@@ -143,9 +188,9 @@ def await_text(path: Path, text: str, patience_s: float = 120.0) -> str:
     return path.read_text("utf-8", "replace").partition(text)[2]
 
 
-def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespace) -> Run:
+def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespace) -> Kills:
     rng = random.Random(f"{options.seed} {number}")
-    run = Run(number)
+    run = Kills(number)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         more = ["--keys", str(options.keys_made)] if options.keys else []
@@ -201,11 +246,7 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             run.equal = finals == {hashlib.sha256(expected).hexdigest()}
         else:
             run.equal = final_in(folder) == expected
-        checked = subprocess.run(
-            [*PROGRAM, "log", "check", "run/log.mcap"],
-            cwd=folder, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        run.lacks = lacking(folder)
+        run.check, run.lacks = complaint(folder), lacking(folder)
         if options.verify:
             again = subprocess.run(
                 [*PROGRAM, "rerun", "run/log.mcap", "--verify"],
@@ -213,7 +254,6 @@ def one(number: int, scenario: Path, expected: bytes, options: argparse.Namespac
             )  # fmt: skip
             run.verified = again.returncode == 0
             (folder / "verified").write_text(again.stdout + again.stderr)
-        run.check = "" if checked.returncode == 0 else (checked.stdout + checked.stderr).strip()
         if not run.good and options.keep:
             keep = Path(options.keep) / f"run{number}"
             keep.parent.mkdir(parents=True, exist_ok=True)
@@ -231,7 +271,7 @@ def await_start(folder: Path, launch: subprocess.Popen[bytes], node: str) -> Non
 
 
 def hit(
-    launch: int, folder: Path, rng: random.Random, what: list[str], stop_s: float, run: Run,
+    launch: int, folder: Path, rng: random.Random, what: list[str], stop_s: float, run: Kills,
     awake: list[tuple[float, int]], at_s: float,
 ) -> None:  # fmt: skip
     stopped = {pid for _, pid in awake}
@@ -253,16 +293,21 @@ def hit(
         run.hit.append((round(at_s, 2), f"{named} for {stop_s:g} s" if stop_s else named))
 
 
-def kept_in(path: Path | None) -> list[Run]:
-    if path is None or not path.exists():
-        return []
-    rows = json.loads(path.read_text())
-    return [Run(**{name: row[name] for name in Run.__dataclass_fields__}) for row in rows]
+R = TypeVar("R", bound=Run)
 
 
-def keep_in(path: Path | None, runs: list[Run]) -> None:
-    if path is not None:
-        path.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
+def play_missing(kind: type[R], options: argparse.Namespace, play: Callable[[int], R]) -> list[R]:
+    """Return the stored runs of `options.json` and the missing ones, each stored and shown."""
+    path, runs = options.json, list[R]()
+    if path is not None and path.exists():
+        names = kind.__dataclass_fields__
+        runs = [kind(**{name: row[name] for name in names}) for row in json.loads(path.read_text())]
+    for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
+        runs.append(play(number))
+        print(runs[-1], flush=True)
+        if path is not None:
+            path.write_text(json.dumps([asdict(run) | {"good": run.good} for run in runs]))
+    return runs
 
 
 def main() -> int:
@@ -302,13 +347,8 @@ def main() -> int:
             subprocess.Popen([sys.executable, "-c", "while True: pass"])
             for _ in range(options.load)
         ]
-        runs = kept_in(options.json)
         try:
-            for number in sorted(set(range(options.runs)) - {run.number for run in runs}):
-                run = one(number, scenario, expected, options)
-                runs.append(run)
-                print(row(run), flush=True)
-                keep_in(options.json, runs)
+            runs = play_missing(Kills, options, lambda n: one(n, scenario, expected, options))
         finally:
             for process in busy:
                 process.kill()
@@ -326,23 +366,6 @@ def main() -> int:
         f"verified {sum(r.verified is True for r in runs)}; load {os.getloadavg()[0]:.0f}"
     )
     return 0 if good == len(runs) else 1
-
-
-def row(run: Run) -> str:
-    what = ", ".join(f"{who} at {at:.1f}" for at, who in run.hit)
-    exit_ = "–" if run.exit is None else run.exit
-    words = [
-        f"{run.number:3} {'good' if run.good else 'BAD '} exit {exit_} {run.wall_s:5.1f} s",
-        "map equal" if run.equal else "MAP DIFFERS",
-        f"hit {what or 'nobody'}",
-        *([f"{run.left} LEFT"] if run.left else []),
-        *([f"GAVE UP: {', '.join(run.gave_up)}"] if run.gave_up else []),
-        *(["NOT VERIFIED"] if run.verified is False else []),
-        *([f"log lacks {', '.join(run.lacks)}"] if run.lacks else []),
-        *([f"check: {run.check.splitlines()[0][:120]}"] if run.check else []),
-        *([f"failures: {run.failures[0][:160]!r}"] if run.failures else []),
-    ]
-    return "; ".join(words)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from pathlib import Path
 from teamslam.sim.scenarios.scenario import load
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.roster import nodes_of
+from tests.namespaces import ip
 from tests.trials.cuts import PORT, Team
 from tests.trials.kills import PROGRAM, expected_of, final_in, shortened
 
@@ -70,10 +71,6 @@ class Run:
             f"{len(self.cuts)} cuts; {self.wall_s:.0f} s; {map_}; died {died or 'nobody'}; "
             f"alive {', '.join(alive) or 'nobody'}; {self.waits} lines of waiting; {self.progress}"
         )
-
-
-def run_ip(*words: str) -> None:
-    subprocess.run(words, check=True)
 
 
 class Radio:
@@ -139,19 +136,19 @@ def radio(loss: int, delay_ms: int, seed: str) -> Iterator[tuple[str, str, Radio
     link = None
     try:
         for name in (home, away):
-            run_ip("ip", "netns", "add", name)
+            ip("netns", "add", name)
             made.append(name)
-            run_ip("ip", "-n", name, "link", "set", "lo", "up")
+            ip("-n", name, "link", "set", "lo", "up")
         link = Radio((home, away), loss, delay_ms, seed)
         for name, address in ((home, HOME), (away, AWAY)):
-            run_ip(*f"ip -n {name} addr add {address}/24 dev radio".split())
-            run_ip("ip", "-n", name, "link", "set", "radio", "up")
+            ip(*f"-n {name} addr add {address}/24 dev radio".split())
+            ip("-n", name, "link", "set", "radio", "up")
         yield home, away, link
     finally:
         if link is not None:
             link.close()
         for name in made:
-            run_ip("ip", "netns", "del", name)
+            ip("netns", "del", name)
 
 
 def one(
@@ -240,9 +237,8 @@ def main() -> int:
         keys.mkdir()
         make_keys(keys, resolved.team, nodes_of(robots), hosts=[HOME])
         expected = expected_of(resolved)
-        links = list(
-            zip(map(int, options.loss.split(",")), map(int, options.delay.split(",")), strict=True)
-        )
+        parts = (map(int, each.split(",")) for each in (options.loss, options.delay))
+        links = list(zip(*parts, strict=True))
         runs = []
         for loss, delay in links * options.runs:
             runs.append(one(loss, delay, scenario, robots, expected, keys, options))

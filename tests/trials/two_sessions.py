@@ -42,6 +42,7 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Sample, opened
 from tests.central.test_saved_map import changed, day, part
+from tests.scenarios import selected
 
 
 class Session(NamedTuple):
@@ -173,23 +174,19 @@ def joined(name: str, first: Session, second: Session, limit_m: float, by: np.nd
     since = {robot: int(stamps_ns[0]) for robot, (stamps_ns, _) in paths.items()}
     landmark = most_observed(second.world, since, {*of_first.truth.values()})
     sensor_of = {each.id: each.sensor for each in second.scenario.robots}
-    streams = tuple(
-        replace(
-            each,
-            landmark_detections=displace(
-                each.landmark_detections, landmark, by, paths[each.robot], sensor_of[each.robot]
-            ),
-        )
-        for each in second.world.streams
-    )
+    streams = []
+    for each in second.world.streams:
+        of = landmark, by, paths[each.robot], sensor_of[each.robot]
+        seen = displace(each.landmark_detections, *of)
+        streams.append(replace(each, landmark_detections=seen))
     assert second.world.landmarks is not None
     places = second.world.landmarks.copy()
     places[np.searchsorted(second.world.landmark_ids, landmark)] += by
-    world = replace(second.world, streams=streams, landmarks=places)
+    world = replace(second.world, streams=tuple(streams), landmarks=places)
     samples, _, _ = day(1, [saved], scenario=second.scenario, streams=world)
     fused = final_map(samples)
-    of = row(f"{name}: displaced", samples, world, of_first.truth).truth
-    told = {of.get(k): each for k, each in changed(fused).items() if each.state != "new"}
+    truth = row(f"{name}: displaced", samples, world, of_first.truth).truth
+    told = {truth.get(k): each for k, each in changed(fused).items() if each.state != "new"}
     found = told.get(landmark)
     if found is None:
         print(f"landmark {landmark} is not found")
@@ -210,18 +207,9 @@ def of_robots(session: Session, robots: Sequence[str], *, begins: bool) -> Sessi
         if each.robot not in robots:
             continue
         seen = each.teammate_detections
-        message = np.repeat(np.arange(len(seen.stamps_ns)), np.diff(seen.offsets))
         chosen = np.array([each.teammates[k] in robots for k in seen.ids.tolist()], np.bool_)
-        counts = np.bincount(message[chosen], minlength=len(seen.stamps_ns))
-        own = replace(
-            seen,
-            offsets=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
-            ids=seen.ids[chosen],
-            ranges=seen.ranges[chosen],
-            bearings=seen.bearings[chosen],
-        )
         start = each.start if begins else None
-        streams.append(replace(each, start=start, teammate_detections=own))
+        streams.append(replace(each, start=start, teammate_detections=selected(seen, chosen)))
     team = tuple(each for each in session.scenario.robots if each.id in robots)
     return Session(
         msgspec.structs.replace(session.scenario, robots=team),

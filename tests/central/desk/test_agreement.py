@@ -15,14 +15,14 @@ from teamslam.team.recording.reader import Tail
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Sample
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
-from tests.support import examples
+from tests.support import example
 
 ROBOTS = ("r1", "r2", "r3")
-TRUE = msgspec.structs.replace(next(e for e in examples() if isinstance(e, m.FusedMap)), final=True)
+TRUE = example(m.FusedMap, final=True)
 FORGED = msgspec.structs.replace(TRUE, dof=99)
 
 
@@ -36,11 +36,10 @@ def final(robot: str, fused: m.FusedMap = TRUE) -> Sample:
 
 def concluded(robot: str, fused: m.FusedMap = TRUE, serial: int = 1) -> Sample:
     sha256 = hashlib.sha256(encoded(fused)).digest()
-    return sample(
-        ch.CONCLUDED,
-        robot,
-        build.concluded(robot=robot, serial=serial, digest=fused.digest, sha256=sha256, submaps=2),
+    message = build.concluded(
+        robot=robot, serial=serial, digest=fused.digest, sha256=sha256, submaps=2
     )
+    return sample(ch.CONCLUDED, robot, message)
 
 
 def scenario(*, peers: bool) -> Sample:
@@ -88,10 +87,7 @@ def test_who_has_no_final_map_is_named_unless_an_operator_has_given_it_up():
     two = HONEST[:4]
     (why,) = judged(*two).disagreement
     assert "r3 has announced no final map" in why
-    for channel, name, order in (
-        (ch.GIVEN_UP, "robot/r3", GIVEN_UP),
-        (ch.ORDER, "r3", WITHDRAWN),
-    ):
+    for channel, name, order in ((ch.GIVEN_UP, "robot/r3", GIVEN_UP), (ch.ORDER, "r3", WITHDRAWN)):
         found = judged(*two, sample(channel, name, order))
         assert found.disagreement == ()
         assert found.agreed is not None
@@ -148,17 +144,6 @@ def test_a_launch_is_over_when_every_peer_has_a_final_map_of_its_own():
         watch.take(own)
     assert watch.is_over
     assert watch.fused is None, "they do not agree"
-    robot.publish(
-        Outgoing(
-            ch.CONCLUDED,
-            "r1",
-            build.concluded(
-                serial=2,
-                digest=TRUE.digest,
-                sha256=hashlib.sha256(encoded(TRUE)).digest(),
-                submaps=2,
-            ),
-        )
-    )
+    robot.publish_raw(concluded("r1", serial=2))
     watch.take(own)
     assert watch.fused == TRUE

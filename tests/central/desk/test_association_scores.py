@@ -12,7 +12,6 @@ from teamslam.central.desk.evaluation.matching import assign, gospa, half_spacin
 from teamslam.team.config import UNNAMED
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
@@ -27,25 +26,21 @@ def sample(channel: ch.Channel, name: str, message: m.Message) -> Sample:
 
 def truth(robot: str, labels: list[int]) -> Sample:
     n = len(labels)
-    stamps = from_stamps(np.arange(n) * TEN)
-    message = m.TruthLabels(
-        stamp_ns=0, robot=robot, stamps=stamps, counts=from_ids([1] * n), labels=from_ids(labels)
-    )
-    return sample(ch.TRUTH_LABELS, robot, message)
+    scans = {"stamps": np.arange(n) * TEN, "counts": [1] * n, "labels": labels}
+    return sample(ch.TRUTH_LABELS, robot, build.built(m.TruthLabels, robot=robot, **scans))
 
 
 def window(robot: str, sequence: int, first: int, landmarks: list[int]) -> Sample:
     n = len(landmarks)
-    numbers = [UNNAMED + x if x >= 0 else UNKNOWN for x in landmarks]
-    message = m.Association(
+    message = build.built(
+        m.Association,
         stamp_ns=(first + n) * TEN,
         robot=robot,
-        incarnation=1,
         sequence=sequence,
-        stamps=from_stamps((first + np.arange(n)) * TEN),
-        counts=from_ids([1] * n),
-        rows=from_ids([0] * n),
-        landmarks=from_ids(numbers),
+        stamps=(first + np.arange(n)) * TEN,
+        counts=[1] * n,
+        rows=[0] * n,
+        landmarks=[UNNAMED + x if x >= 0 else UNKNOWN for x in landmarks],
     )
     return sample(ch.ASSOCIATION, robot, message)
 
@@ -53,14 +48,14 @@ def window(robot: str, sequence: int, first: int, landmarks: list[int]) -> Sampl
 def final(table: dict[str, list[tuple[int, int, int]]]) -> Sample:
     """By robot: (sequence, local, identity − 2³¹)."""
     memberships = tuple(
-        m.Membership(
+        build.built(
+            m.Membership,
             robot=robot,
-            incarnation=1,
-            sequences=from_ids([row[0] for row in rows]),
-            locals=from_ids([row[1] for row in rows]),
-            identities=from_ids([UNNAMED + row[2] for row in rows]),
+            sequences=[row[0] for row in rows],
+            locals=[row[1] for row in rows],
+            identities=[UNNAMED + row[2] for row in rows],
             steps=bytes(len(rows)),
-            figures=from_floats(np.zeros(3 * len(rows))),
+            figures=np.zeros(3 * len(rows)),
         )
         for robot, rows in table.items()
     )

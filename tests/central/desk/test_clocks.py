@@ -1,3 +1,5 @@
+from array import array
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,19 +9,22 @@ from teamslam.central.desk.evaluation.clocks import (
     BEYOND_DOUBT,
     Timed,
     lateness,
+    mirrored_cause,
     separate_times_warning,
 )
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.evaluation.log import collect_log
+from teamslam.central.desk.evaluation.states import RobotState
 from teamslam.central.desk.presence import Presence
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.sim.cli.launch import _time_warnings
 from teamslam.sim.publisher.node import WorldNode
-from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of
 from teamslam.team.config import RobotConfig, Sensor
-from teamslam.team.wire.bus import Sample
+from teamslam.team.wire import messages as m
+from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.digest import announce_configuration
 from tests import build
 from tests.commands import run
@@ -31,13 +36,17 @@ LATE_S = 0.1
 
 
 def published(world: StressWorld, place: Path) -> list[Sample]:
-    of = scenario_in(write(world, place))
+    out = published_by(scenario_in(write(world, place)))
+    out.append(final_map([1], np.zeros((1, 2)), np.eye(2)))
+    return samples([each for each in out if "truth" not in each.key])
+
+
+def published_by(of: Scenario) -> list[Outgoing]:
     node = WorldNode(streams_of(of), frozenset(), announce_configuration("world", 0, 0, of))
     out = node.begin()
     while not node.ended:
         out += node.publish(0.0)
-    out.append(final_map([1], np.zeros((1, 2)), np.eye(2)))
-    return samples([each for each in out if "truth" not in each.key])
+    return out
 
 
 def timed_of(log: list[Sample], robot: str) -> Timed:
@@ -121,11 +130,7 @@ def test_import_and_result_name_robots_with_clocks_of_different_epochs(tmp_path)
     of = with_options(load(str(scenario_beside(tmp_path / "mine"))), dataset=tmp_path / "mine")
     *_, before = _time_warnings(streams_of(of))
     assert expected in before
-    node = WorldNode(streams_of(of), frozenset(), announce_configuration("world", 0, 0, of))
-    out = node.begin()
-    while not node.ended:
-        out += node.publish(0.0)
-    (warning,) = evaluate(samples(out)).warnings
+    (warning,) = evaluate(samples(published_by(of))).warnings
     assert expected in warning
 
 
@@ -153,11 +158,8 @@ IN_TIME, YEARS = (0.0, 0.0), (5e8, 5e8)
 @pytest.mark.parametrize(
     ("clocks", "words"),
     [
-        ((IN_TIME, IN_TIME, (7.0, 7.0)), "stamps 7.0 s behind the others: set its machine's clock"),
-        (
-            (IN_TIME, IN_TIME, (-7.0, -7.0)),
-            "stamps 7.0 s ahead of the others: set its machine's clock",
-        ),
+        ((IN_TIME, IN_TIME, (7.0, 7.0)), "stamps 7.0 s behind the others: set its machine"),
+        ((IN_TIME, IN_TIME, (-7.0, -7.0)), "stamps 7.0 s ahead of the others: set its machine"),
         ((IN_TIME, IN_TIME, (9.0, 7.0)), "it lags and catches up: its program delivers old"),
         ((IN_TIME, IN_TIME, (6.0, 7.0)), "it lags and falls further behind"),
         ((YEARS, YEARS, (5e8 + 20, 5e8 + 20)), "began later or go slower: the map waits for them"),
@@ -169,4 +171,60 @@ def test_who_lags_or_replays_is_not_told_to_set_its_clock(clocks, words):
     (advice,) = presence(*clocks).advice()
     assert advice.startswith("source/r3 stamps ")
     assert words in advice
-    assert ("set its machine's clock" in advice) == ("set its machine's clock" in words)
+    assert ("set its machine's clock" in advice) == ("set its machine" in words)
+
+
+# Bearings with the wrong sign.
+
+
+ALONE = StressWorld(robots=1, seconds=150.0)
+
+
+@pytest.fixture(scope="module", params=[1, 2, 3])
+def sound(request, tmp_path_factory):
+    world = replace(ALONE, seed=request.param)
+    return timed_of(published(world, tmp_path_factory.mktemp("sound")), "r1")
+
+
+def mirrored(timed: Timed) -> Timed:
+    seen = np.array(timed.seen).reshape(-1, 2) * (1.0, -1.0)
+    return replace(timed, seen=array("d", seen.ravel().tolist()))
+
+
+def test_a_robot_alone_with_mirrored_bearings_is_named_and_nothing_else_of_it(tmp_path):
+    log = published(replace(ALONE, mirrored=("r1",)), tmp_path)
+    (found,) = to_json(evaluate(log))["diagnosis"]
+    assert (found["cause"], found["robot"], found["value"]) == ("mirrored", "r1", -1.0)
+    assert found["text"].startswith("r1's bearings have the wrong sign: negate")
+
+
+@pytest.mark.parametrize("mirrored", [("r1",), ("r1", "r2")])
+def test_a_map_with_mirrored_robots_fails_and_names_them(mirrored, tmp_path):
+    result = evaluate(published(replace(ALONE, robots=2, mirrored=mirrored), tmp_path))
+    inside = {robot: RobotState("joined") for robot in ("r1", "r2")}
+    failures = replace(result, states=inside).failures
+    assert len(failures) == len(mirrored)
+    for robot, failure in zip(mirrored, failures, strict=True):
+        assert f"not to be used: {robot}'s bearings have the wrong sign: negate" in failure
+    outside = inside | {robot: RobotState("withdrawn", "by operator") for robot in mirrored}
+    assert replace(result, states=outside).failures == tuple(
+        f"{robot} withdrawn: by operator" for robot in mirrored
+    )
+
+
+@pytest.mark.parametrize(
+    "sensor", [Sensor(mount=(0.5, 0.2, 0.3)), Sensor(bearing_offset=0.3), Sensor(range_offset=0.3)]
+)
+def test_a_wrong_calibration_is_not_taken_for_a_reflection(sound, sensor):
+    assert mirrored_cause("r1", sound, RobotConfig("r1", sensor=sensor)) is None
+
+
+def test_a_mirrored_robot_explains_its_other_causes_and_no_other_robots(tmp_path):
+    result = evaluate(published(replace(ALONE, robots=2, mirrored=("r1",)), tmp_path))
+    causes = [m.Diagnosis(cause="noise_underestimated", robot=each) for each in ("r1", "r2", "")]
+    result = replace(result, map=replace(result.map, diagnosis=tuple(causes)))
+    assert [(each.cause, each.robot) for each in result.diagnosis] == [
+        ("mirrored", "r1"),
+        ("noise_underestimated", "r2"),
+        ("noise_underestimated", ""),
+    ]

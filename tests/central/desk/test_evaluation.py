@@ -17,6 +17,7 @@ from teamslam.central.desk.evaluation.errors import (
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.report.tables import team_rows
+from teamslam.team.config import UNNAMED
 from teamslam.team.translate import joint_bytes
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -48,26 +49,16 @@ def stamps(*seconds: float) -> np.ndarray:
     return np.rint(np.array(seconds) * SECOND).astype(np.int64)
 
 
-def done(measurements: int, ledger: tuple[tuple[str, int], ...]) -> Outgoing:
-    entries = tuple(m.Disposition(disposition=name, measurements=count) for name, count in ledger)
-    return Outgoing(
-        ch.ROBOT_DONE,
-        "r1",
-        build.done(stamp_ns=9, measurements=measurements, steps=20, submaps=2, ledger=entries),
-    )
+def done(measurements: int, in_submaps: int) -> Outgoing:
+    ledger = (m.Disposition(disposition="in a submap", measurements=in_submaps),)
+    last = build.done(stamp_ns=9, measurements=measurements, steps=20, submaps=2, ledger=ledger)
+    return Outgoing(ch.ROBOT_DONE, "r1", last)
 
 
 def submap(sequence: int, first: int, last: int) -> Outgoing:
-    message = build.submap(
-        stamp_ns=sequence + 1,
-        sequence=sequence,
-        first_measurement=first,
-        last_measurement=last,
-        start_ns=0,
-        ids=[],
-        mean=np.zeros(3),
-        covariance=joint_bytes(np.eye(3)),
-    )
+    used = {"first_measurement": first, "last_measurement": last}
+    empty = {"ids": [], "mean": np.zeros(3), "covariance": joint_bytes(np.eye(3))}
+    message = build.submap(stamp_ns=sequence + 1, sequence=sequence, start_ns=0, **used, **empty)
     return Outgoing(ch.SUBMAP, "r1", message)
 
 
@@ -181,7 +172,7 @@ def test_the_json_has_no_unaligned_figure_of_an_arbitrary_frame():
     ids=["disjoint", "a measurement in two submaps", "a ledger that counts one twice"],
 )
 def test_a_measurement_that_is_used_twice_is_found(first, counted, once):
-    said = [submap(0, 0, 20), submap(1, first, 40), done(41, (("in a submap", counted),))]
+    said = [submap(0, 0, 20), submap(1, first, 40), done(41, counted)]
     robot = evaluate(world_log(scenario()) + samples(said)).robots["r1"]
     assert robot.consumption.consumed == 41
     assert robot.consumption.each_once == once
@@ -204,12 +195,8 @@ def test_the_trajectory_aligns_itself_where_the_map_can_not():
     of = scenario()
     stream = streams(of).streams[0]
     assert stream.truth is not None
-    turned = np.array(
-        [
-            [*transform_points(np.array([1.0, 2.0, 0.3]), p[np.newaxis, :2])[0], p[2]]
-            for p in stream.truth
-        ]
-    )
+    places = transform_points(np.array([1.0, 2.0, 0.3]), stream.truth[:, :2])
+    turned = np.column_stack([places, stream.truth[:, 2]])
     said = [trajectory("r1", stream.truth_ns.tolist(), turned, 1.0)]
     robot = evaluate(world_log(of) + samples(said)).robots["r1"]
     assert robot.alignment == "trajectory"
@@ -235,34 +222,32 @@ def test_the_own_pose_counts_only_where_there_is_no_team_pose():
 
 def test_damaged_messages_are_counted_and_left_out():
     log = joined_log(scenario(), 0.1)
-    damaged = [
-        replace(s, payload=s.payload[:-3])
-        if s.key in (ch.FINAL_MAP.key(), ch.START.key("r1"))
-        else s
-        for s in log
-    ]
+    torn = (ch.FINAL_MAP.key(), ch.START.key("r1"))
+    damaged = [replace(s, payload=s.payload[:-3]) if s.key in torn else s for s in log]
     run = evaluate([*damaged, Sample("nobody/knows", b"\xc1", 0, 0, 0)])
     assert run.map is None
     assert run.unsound == 2
     assert run.channels["nobody/knows"].bytes == 1
 
 
+FIGURES = (
+    "landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof", "joint_cost_per_dof",
+    "shape_nees_per_landmark", "shape_coverage_95", "landmark_coverage_95",
+    "landmarks", "final_map_digest", "robots", "channels", "processes", "log", "wall_s",
+)  # fmt: skip
+ROBOT_FIGURES = (
+    "steps", "measurements_published", "measurements_consumed", "position_rmse_m",
+    "heading_rmse_rad", "pose_nees_per_dof", "pose_coverage_95", "uplink_bytes", "submaps",
+    "position_rmse_aligned_m", "online_position_rmse_m", "online_position_rmse_aligned_m",
+    "online_pose_nees_per_dof", "online_pose_coverage_95",
+)  # fmt: skip
+
+
 def test_the_json_has_every_promised_name_and_takes_what_the_launcher_adds():
     extra = {"processes": {"world": {"pid": 7, "exit": 0}}, "log": "run.mcap", "wall_s": 1.5}
     figures = json.loads(json.dumps(to_json(evaluate(joined_log(scenario(), 0.1)), extra)))
-    names = (
-        "landmark_rmse_m", "landmark_rmse_aligned_m", "map_nees_per_dof", "joint_cost_per_dof",
-        "shape_nees_per_landmark", "shape_coverage_95", "landmark_coverage_95",
-        "landmarks", "final_map_digest", "robots", "channels", "processes", "log", "wall_s",
-    )  # fmt: skip
-    of_a_robot = (
-        "steps", "measurements_published", "measurements_consumed", "position_rmse_m",
-        "heading_rmse_rad", "pose_nees_per_dof", "pose_coverage_95", "uplink_bytes", "submaps",
-        "position_rmse_aligned_m", "online_position_rmse_m", "online_position_rmse_aligned_m",
-        "online_pose_nees_per_dof", "online_pose_coverage_95",
-    )  # fmt: skip
-    assert set(names) <= set(figures)
-    assert set(of_a_robot) <= set(figures["robots"]["r1"])
+    assert set(FIGURES) <= set(figures)
+    assert set(ROBOT_FIGURES) <= set(figures["robots"]["r1"])
     assert figures["processes"]["world"]["exit"] == 0
     assert set(figures["channels"][ch.ODOMETRY.key("r1")]) == {"messages", "bytes"}
 
@@ -283,34 +268,27 @@ def test_a_frame_that_is_turned_about_its_origin_is_off_by_that_turn_alone():
 
 def test_what_a_driver_never_got_is_a_note():
     figures = {"messages": 90.0, "messages_lost": 9.0, "messages_dropped": 1.0}
-    said = build.status(stamp_ns=1, node="source/r1", state="ended", figures=figures)
-    (note,) = evaluate(
-        world_log(scenario()) + samples([Outgoing(ch.STATUS, "source/r1", said)])
-    ).notes
+
+    def notes(**of: object) -> tuple[str, ...]:
+        said = build.status(stamp_ns=1, node="source/r1", state="ended", **of)
+        log = world_log(scenario()) + samples([Outgoing(ch.STATUS, "source/r1", said)])
+        return evaluate(log).notes
+
+    (note,) = notes(figures=figures)
     assert note.startswith("r1: 10 messages of its topics are not in its stream, beside 90")
-    none = build.status(stamp_ns=1, node="source/r1", state="ended")
-    assert not evaluate(
-        world_log(scenario()) + samples([Outgoing(ch.STATUS, "source/r1", none)])
-    ).notes
-
-
-UNNAMED_IDS = [2**31 + k for k in range(9)]
+    assert not notes()
 
 
 def unnamed_log(means: np.ndarray, *, named: int = 0, labels: bool = False) -> list[Sample]:
     """A world whose final map has landmarks without identities, the first `named` excepted."""
     of = scenario()
     world = streams(of)
-    ids = [*world.landmark_ids.tolist()[:named], *UNNAMED_IDS[: len(means) - named]]
+    ids = [*world.landmark_ids.tolist()[:named], *range(UNNAMED, UNNAMED + len(means) - named)]
     said = [final_map(ids, means, 0.01 * np.eye(2 * len(means)))]
     if labels:  # a scan without labels
-        unknown = m.TruthLabels(
-            robot="r1",
-            stamp_ns=5,
-            stamps=from_stamps([5]),
-            counts=from_ids([1]),
-            labels=from_ids([m.NO_LABEL]),
-        )
+        scan = {"stamps": from_stamps([5]), "counts": from_ids([1])}
+        none = from_ids([m.NO_LABEL])
+        unknown = m.TruthLabels(robot="r1", stamp_ns=5, **scan, labels=none)
         said.append(Outgoing(ch.TRUTH_LABELS, "r1", unknown))
     return world_log(of) + samples(said)
 

@@ -1,10 +1,11 @@
 import pytest
+from msgspec.structs import replace
 
 from teamslam.central.desk.evaluation.events import EventDetector
 from teamslam.central.desk.names import data_set_of, without_decimals
 from teamslam.team.wire import messages as m
 from tests import build
-from tests.support import fused_map
+from tests.support import example, fused_map
 
 
 def told(*messages: m.Message) -> list[tuple[str, str]]:
@@ -63,7 +64,7 @@ def test_a_robot_that_waits_for_its_place_is_not_told_to_be_in_the_map():
 def test_a_withdrawal_is_told_once_with_its_reason():
     said = build.withdrawal(stamp_ns=3, robot="r2", by="central", reason="its wheels slip")
     assert told(fused(["r1", "r2"]), said, said, fused(["r1"]))[2:] == [
-        ("withdrawn", "r2 is withdrawn by the centre: its wheels slip"),
+        ("withdrawn", "r2 is withdrawn by the centre: its wheels slip")
     ]
 
 
@@ -111,3 +112,17 @@ def test_the_end_of_the_world_and_its_notes_are_told_once():
 )
 def test_a_data_set_is_named_where_the_scenario_is_readable(scenario, name):
     assert data_set_of(scenario) == name
+
+
+def test_a_closure_is_an_event_once_and_so_is_that_it_is_undone():
+    detector, closed = EventDetector(), example(m.FusedMap)
+    (closure,) = (each for each in detector.take(closed, 0) if each.kind == "closure")
+    assert closure.text == (
+        "alpha (incarnation 1) and bravo (incarnation 0) merged by their maps: 12 landmarks, "
+        "log-likelihood ratio 40 against 6, share 0.75, 0 absent"
+    )
+    undone = replace(closed.decisions[0], kind="undone", why="share 0.41 < 0.5 after 3 ticks")
+    again = replace(closed, decisions=(*closed.decisions, undone))
+    for expected in (["undone"], []):
+        found = [each.kind for each in detector.take(again, 0)]
+        assert [kind for kind in found if kind in ("closure", "undone")] == expected

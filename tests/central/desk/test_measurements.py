@@ -11,34 +11,24 @@ from teamslam.team.wire.codec import encoded
 from tests import build
 
 numbers = st.integers(0, 12)
+
+
+def name_of(number):
+    return {"stamp_ns": 10 * number, "incarnation": 0, "number": number}
+
+
 plain = st.builds(
-    lambda number, forward: build.odometry(
-        stamp_ns=10 * number,
-        incarnation=0,
-        number=number,
-        duration_ns=10,
-        forward=forward,
-        yaw_rate=0.0,
-    ),
+    lambda number, forward: build.odometry(**name_of(number), duration_ns=10, forward=forward),
     numbers,
     st.sampled_from([1.0, 1.0, 1.0, 2.0]),
 )
 steering = st.builds(
     lambda number: m.Steering(
-        stamp_ns=10 * number,
-        robot="r1",
-        incarnation=0,
-        number=number,
-        duration_ns=10,
-        wheel_speed=1.0,
-        steering=0.0,
+        **name_of(number), robot="r1", duration_ns=10, wheel_speed=1.0, steering=0.0
     ),
     numbers,
 )
-scan = st.builds(
-    lambda number: build.observations(stamp_ns=10 * number, incarnation=0, number=number),
-    numbers,
-)
+scan = st.builds(lambda number: build.observations(**name_of(number)), numbers)
 logs = st.lists(st.one_of(plain, plain, steering, scan), max_size=30)
 
 
@@ -74,9 +64,8 @@ def test_unsound_odometry_is_counted_and_another_robots_is_not_taken():
     sound = build.odometry(stamp_ns=1, incarnation=0, number=1, duration_ns=1, yaw_rate=0.0)
     other = msgspec.structs.replace(sound, robot="r2")
     found = Recorded()
-    found.take_all(
-        [sample_of(sound), sample_of(other), Sample("source/r1/odometry", b"x", 0, 0, 0)]
-    )
+    unsound = Sample("source/r1/odometry", b"x", 0, 0, 0)
+    found.take_all([sample_of(sound), sample_of(other), unsound])
     assert found.unsound == 2
     assert [*found.measurements] == [("r1", 0)]
     assert np.array_equal([*found.measurements["r1", 0]], [1])

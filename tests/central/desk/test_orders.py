@@ -1,5 +1,6 @@
 import threading
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 
 import msgspec
 import pytest
@@ -16,52 +17,54 @@ from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests import commands
-from tests.support import examples, fused_map, on_its_key, wait_until
+from tests.support import example, fused_map, on_its_key, wait_until
 
-FUSED = next(e for e in examples() if isinstance(e, m.FusedMap))
-EXAMPLE = next(e for e in examples() if isinstance(e, m.Configuration))
-CONFIG = on_its_key(ch.ROBOT_CONFIG, "r3", EXAMPLE)
-
-
-class Centre(threading.Thread):
-    def __init__(self, network: MemoryNetwork, answer: m.FusedMap | None) -> None:
-        super().__init__(daemon=True)
-        self.bus, self.answer = MemoryBus(network), answer
-        self.bus.declare_alive("central")
-        self.bus.subscribe(ch.ORDER)
-        self.orders: list[m.Withdrawal] = []
-        self.over = threading.Event()
-
-    def run(self) -> None:
-        while not self.over.wait(0.01):
-            self.bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
-            for sample in self.bus.receive(0.0):
-                _, _, message = opened(sample)
-                assert isinstance(message, m.Withdrawal)
-                self.orders.append(message)
-                if self.answer is not None:
-                    channel = ch.FINAL_MAP if self.answer.final else ch.FUSED_MAP
-                    self.bus.publish(Outgoing(channel, "", self.answer))
+FUSED = example(m.FusedMap)
+CONFIG = on_its_key(ch.ROBOT_CONFIG, "r3", example(m.Configuration))
 
 
-def ordered(monkeypatch: pytest.MonkeyPatch, robot: str = "r3", **answer: object) -> Centre:
-    monkeypatch.setattr(orders, "CENTRE_S", 30.0 if robot == "r3" else 2.0)
-    network = MemoryNetwork()
-    reply = msgspec.structs.replace(FUSED, **answer) if answer else None
-    centre = Centre(network, reply)
-    centre.start()
+@contextmanager
+def centre(network: MemoryNetwork, turn: Callable[[MemoryBus], None]) -> Iterator[None]:
+    """A centre that announces r3, receives orders and takes these turns until the end."""
+    bus, over = MemoryBus(network), threading.Event()
+    bus.declare_alive("central")
+    for channel in (ch.ORDER, ch.GIVEN_UP):
+        bus.subscribe(channel)
+
+    def run() -> None:
+        while not over.wait(0.01):
+            bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
+            turn(bus)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
     try:
-        withdraw(MemoryBus(network), robot, "a flat wheel", 30.0 if answer else 1.0)
-        wait_until(lambda: bool(centre.orders), what="the order")
+        yield
     finally:
-        centre.over.set()
-        centre.join()
-    return centre
+        over.set()
+        thread.join()
+
+
+def ordered(monkeypatch: pytest.MonkeyPatch, **answer: object) -> list[m.Message]:
+    monkeypatch.setattr(orders, "CENTRE_S", 30.0)
+    network, received = MemoryNetwork(), []
+
+    def turn(bus: MemoryBus) -> None:
+        for sample in bus.receive(0.0):
+            received.append(opened(sample)[2])
+            if answer:
+                reply = msgspec.structs.replace(FUSED, **answer)
+                bus.publish(Outgoing(ch.FINAL_MAP if reply.final else ch.FUSED_MAP, "", reply))
+
+    with centre(network, turn):
+        withdraw(MemoryBus(network), "r3", "a flat wheel", 30.0 if answer else 1.0)
+        wait_until(lambda: bool(received), what="the order")
+    return received
 
 
 def test_an_order_is_given_once_and_followed(monkeypatch):
-    centre = ordered(monkeypatch, final=False, withdrawn=("r3",))
-    (order,) = centre.orders
+    (order,) = ordered(monkeypatch, final=False, withdrawn=("r3",))
+    assert isinstance(order, m.Withdrawal)
     assert (order.robot, order.by, order.reason) == ("r3", "operator", "a flat wheel")
 
 
@@ -85,29 +88,18 @@ def test_without_a_centre_there_is_nobody_to_order(monkeypatch):
 
 
 def test_an_order_to_wait_for_a_robot_no_more_is_heard_by_the_centre_and_told(monkeypatch):
-    network = MemoryNetwork()
-    bus = MemoryBus(network)
-    bus.declare_alive("central")
-    bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
-    bus.subscribe(ch.GIVEN_UP)
-    node, over = CentralNode(CentralConfig(), ["r1", "r3"]), threading.Event()
+    network, node = MemoryNetwork(), CentralNode(CentralConfig(), ["r1", "r3"])
 
-    def centre() -> None:
-        while not over.wait(0.01):
-            for sample in bus.receive(0.0):
-                node.handle(opened(sample)[2])
-            bus.publish(Outgoing(ch.STATUS, "central", node.status()))
+    def turn(bus: MemoryBus) -> None:
+        for sample in bus.receive(0.0):
+            node.handle(opened(sample)[2])
+        bus.publish(Outgoing(ch.STATUS, "central", node.status()))
 
-    thread = threading.Thread(target=centre, daemon=True)
-    thread.start()
-    try:
+    with centre(network, turn):
         give_up(MemoryBus(network), "r3", "it fell into the water", 30.0)
         monkeypatch.setattr(orders, "CENTRE_S", 2.0)
         with pytest.raises(WithdrawError, match="the team has no robot r9; its robots: r3"):
             give_up(MemoryBus(network), "r9", "", 1.0)
-    finally:
-        over.set()
-        thread.join()
     assert "r3 is given up" in node.status().warnings[0]
 
 
@@ -119,13 +111,10 @@ def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(monkey
     stranger.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
     for channel in (ch.ROBOT_CONFIG, ch.STATUS, ch.FUSED_MAP, ch.FINAL_MAP):
         stranger.publish_raw(Sample(channel.key("r4"), b"\xc1", 0, 0, 0))
-    judgement = m.Judgement(
-        first=local_landmark("r3/1/2/3"), second=local_landmark("r3/1/4/5"), same=True
-    )
     for order in (
         lambda bus: withdraw(bus, "r3", "", 0.2),
         lambda bus: give_up(bus, "r3", "", 0.2),
-        lambda bus: judge(bus, judgement, "", 0.2),
+        lambda bus: judge(bus, pair(True), "", 0.2),
     ):
         with pytest.raises(WithdrawError, match=r"within 0.2 s; the (order stands|verdict is rec)"):
             order(MemoryBus(network))
@@ -133,25 +122,12 @@ def test_what_is_no_message_of_the_team_does_not_end_an_operators_command(monkey
 
 def said(monkeypatch: pytest.MonkeyPatch, *words: str, rests_on: tuple[m.Judgement, ...]) -> Result:
     monkeypatch.setattr(orders, "CENTRE_S", 2.0)
-    network = MemoryNetwork()
-    bus, over = MemoryBus(network), threading.Event()
-    bus.declare_alive("central")
-
-    def centre() -> None:
-        while not over.wait(0.01):
-            bus.publish(Outgoing(ch.ROBOT_CONFIG, "r3", CONFIG))
-            bus.publish(Outgoing(ch.FUSED_MAP, "", fused_map(verdicts=rests_on)))
-
-    thread = threading.Thread(target=centre, daemon=True)
-    thread.start()
+    network, running = MemoryNetwork(), Outgoing(ch.FUSED_MAP, "", fused_map(verdicts=rests_on))
     monkeypatch.setattr(
         "teamslam.sim.cli.options.connect_bus", lambda *_: nullcontext(MemoryBus(network))
     )
-    try:
+    with centre(network, lambda bus: bus.publish(running)):
         return commands.run("verdict", *words, "--team", "t")
-    finally:
-        over.set()
-        thread.join()
 
 
 def pair(same: bool) -> m.Judgement:

@@ -11,18 +11,10 @@ from matplotlib.text import Text
 from PIL import Image
 
 from teamslam.central.desk.compare import compare_rows, draw_maps
-from teamslam.central.desk.drawing import (
-    ELLIPSE_SCALE,
-    curve_through,
-    ellipses,
-)
+from teamslam.central.desk.drawing import ELLIPSE_SCALE, curve_through, ellipses
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.pictures import film
-from teamslam.central.desk.pictures.run import (
-    error_picture,
-    map_picture,
-    new_figure,
-)
+from teamslam.central.desk.pictures.run import error_picture, map_picture, new_figure
 from teamslam.central.desk.pictures.style import (
     PAPER_DPI,
     PAPER_PT,
@@ -42,6 +34,21 @@ from tests.sim.logs import joined_log, scenario, without_starts
 @pytest.fixture(scope="module")
 def run():
     return evaluate(joined_log(scenario(robots=2), 0.1))
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that would be saved."""
+    found: list[Figure] = []
+    for module in ("pictures.run", "compare"):
+        name = f"teamslam.central.desk.{module}.save"
+        monkeypatch.setattr(name, lambda figure, _: found.append(figure))
+    return found
+
+
+def labels_of(figure: Figure) -> list[str]:
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
 
 
 @settings(deadline=None, max_examples=50)
@@ -71,28 +78,20 @@ def test_between_two_poses_a_path_is_drawn_as_the_arc_that_it_was(speed):
 
 
 def test_the_same_run_draws_the_same_bytes(run, tmp_path):
-    pictures = []
     for name in ("a.png", "b.png"):
         map_picture(run, tmp_path / name)
-        pictures.append((tmp_path / name).read_bytes())
-    assert pictures[0] == pictures[1]
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(run, tmp_path, monkeypatch):
+def test_a_robot_without_a_place_in_the_map_is_not_drawn_in_its_frame(run, tmp_path, drawn):
     """Such a path would begin at the origin of the team's map."""
-    drawn: list[Figure] = []
-    monkeypatch.setattr(
-        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
-    )
     path = run.robots["r2"].smoothed_path
     nowhere = replace(path, stamps_ns=path.stamps_ns[:0], poses=path.poses[:0])
     alone = replace(run.robots["r2"], smoothed_path=nowhere)
     assert map_picture(replace(run, robots={**run.robots, "r2": alone}), tmp_path / "map.png")
-    (legend,) = drawn[0].legends
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert "r1" in labels
-    assert "r2: not in this map" in labels
-    entry = legend.legend_handles[labels.index("r2: not in this map")]
+    labels = labels_of(drawn[0])
+    assert {"r1", "r2: not in this map"} <= {*labels}
+    entry = drawn[0].legends[0].legend_handles[labels.index("r2: not in this map")]
     assert (entry.get_linestyle(), entry.get_marker()) == ("None", "s")  # its start alone is drawn
     assert not any("online" in label for label in labels)
 
@@ -116,16 +115,11 @@ def test_a_run_is_drawn_as_a_film_and_nothing_without_a_map(run, tmp_path, monke
 
 
 def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_factor(
-    run, tmp_path, monkeypatch
+    run, tmp_path, drawn
 ):
-    drawn: list[Figure] = []
-    monkeypatch.setattr(
-        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
-    )
     small = replace(run, map=replace(run.map, covariance=1e-8 * np.eye(len(run.map.covariance))))
     assert map_picture(small, tmp_path / "map.png")
-    (legend,) = drawn[0].legends
-    labels = [text.get_text() for text in legend.get_texts()]
+    labels = labels_of(drawn[0])
     assert "landmarks, 95 % ellipses × 100" in labels
     assert "true landmarks, errors × 100" in labels
     (crosses,) = (x for x in drawn[0].axes[0].lines if str(x.get_label()).startswith("true land"))
@@ -135,11 +129,7 @@ def test_small_ellipses_are_magnified_with_the_errors_and_the_legend_has_the_fac
     np.testing.assert_allclose(found[: len(expected)], expected)
 
 
-def test_changes_since_the_saved_map_are_drawn_as_on_the_page(run, tmp_path, monkeypatch):
-    drawn: list[Figure] = []
-    monkeypatch.setattr(
-        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
-    )
+def test_changes_since_the_saved_map_are_drawn_as_on_the_page(run, tmp_path, drawn):
     first, second, third = run.map.ids[:3].tolist()
     changes = (
         m.LandmarkChange(landmark=first, state="moved", dx=2.0, dy=1.0),
@@ -167,7 +157,7 @@ def test_changes_since_the_saved_map_are_drawn_as_on_the_page(run, tmp_path, mon
     assert dict(team_rows(run))["landmarks"] == f"{count} in the final map"
 
 
-def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path, monkeypatch):
+def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path, drawn):
     of = scenario(robots=2)
     run = evaluate(joined_log(without_starts(of), 0.1))
     assert run.arbitrary_frame
@@ -178,22 +168,14 @@ def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path, mo
     assert told["after rigid alignment"] != "–"
     assert "map NEES per dof" not in told
     assert not error_picture(run, tmp_path / "errors.png")
-    drawn: list[Figure] = []
-    monkeypatch.setattr(
-        "teamslam.central.desk.pictures.run.save", lambda figure, _: drawn.append(figure)
-    )
     for each in (run, known):
         assert map_picture(each, tmp_path / "map.png")
-    texts = [[x.get_text() for x in figure.legends[0].get_texts()] for figure in drawn]
-    assert [any("the frame's own error" in x for x in of) for of in texts] == [True, False]
+    texts = [" ".join(labels_of(figure)) for figure in drawn]
+    assert ["the frame's own error" in each for each in texts] == [True, False]
     assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))
 
 
-def test_compared_maps_in_an_arbitrary_frame_lie_over_the_aligned_truth(tmp_path, monkeypatch):
-    drawn: list[Figure] = []
-    monkeypatch.setattr(
-        "teamslam.central.desk.compare.save", lambda figure, _: drawn.append(figure)
-    )
+def test_compared_maps_in_an_arbitrary_frame_lie_over_the_aligned_truth(tmp_path, drawn):
     of = scenario(robots=2)
     for each in (of, without_starts(of)):
         run = evaluate(joined_log(each, 3.0))

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
@@ -12,12 +13,12 @@ from teamslam.central.desk.evaluation.history import history
 from teamslam.central.desk.report import page as report_page
 from teamslam.central.desk.report.page import write_report
 from teamslam.central.desk.report.run import Run, run_figures
-from teamslam.sim.in_memory.team import run_team
+from teamslam.team import translate
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire import channels as ch
-from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.bus import Sample, opened
 from tests import commands
-from tests.sim.logs import joined_log, scenario, streams, world_log
+from tests.sim.logs import final_map, joined_log, scenario, streams, world_log
 
 PICTURES = ["map", "errors", "consistency"]
 
@@ -32,11 +33,10 @@ def page_of(run: Run, folder: Path) -> str:
 
 
 @pytest.fixture(scope="module")
-def log():
-    of = scenario(robots=2)
+def log(log):
+    """With times of arrival."""
     return [
-        msgspec.structs.replace(sample, wall_ns=(k + 1) * 1_000_000)
-        for k, sample in enumerate(run_team(of, streams(of)))
+        msgspec.structs.replace(sample, wall_ns=(k + 1) * 1_000_000) for k, sample in enumerate(log)
     ]
 
 
@@ -49,14 +49,8 @@ def test_it_is_one_page_that_needs_nothing_else(log, tmp_path):
     run = replace(run_of(log, **{"seed": "1", "version.teamslam": "0.0.7"}), command="teamslam <x>")
     paths = write_report(run, tmp_path / "new", to_json(run.evaluation, run_figures(run)))
     names = [path.name for path in paths]
-    assert names == [
-        "report.html",
-        "report.json",
-        "map.csv",
-        "map.json",
-        *(f"{p}.png" for p in PICTURES),
-        "trajectories",
-    ]
+    tables = ["report.html", "report.json", "map.csv", "map.json"]
+    assert names == [*tables, *(f"{p}.png" for p in PICTURES), "trajectories"]
     page = paths[0].read_text("utf-8")
     assert page.count("data:image/svg+xml;base64,") == len(PICTURES)
     assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
@@ -142,13 +136,52 @@ def test_a_log_that_lacks_what_the_ledger_needs_names_it_beside_the_run_or_in_a_
     commands.output_of("report", file, "-o", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
     assert "the log has no configuration of robot/r1" in page
-    beside = commands.run("report", file, "--no-ledger")
-    assert beside.exit_code == 0, beside.output
-    assert f"wrote {tmp_path / 'report.html'}" in beside.output.replace("\n", "")
-    other = tmp_path / "other.mcap"
-    file.rename(other)
-    beside = commands.run("report", other, "--no-ledger")
+    beside = commands.output_of("report", file, "--no-ledger")
+    assert f"wrote {tmp_path / 'report.html'}" in beside.replace("\n", "")
+    other = file.rename(tmp_path / "other.mcap")
+    commands.output_of("report", other, "--no-ledger")
     assert (tmp_path / "other" / "report.html").is_file()
-    file = other
-    told = commands.output_of("report", file, "-o", file, status=2)
-    assert "give a folder" in told
+    assert "give a folder" in commands.output_of("report", other, "-o", other, status=2)
+
+
+# The history.
+
+
+@pytest.fixture(scope="module")
+def found(log):
+    return history(log)
+
+
+def test_nis_is_what_the_robots_said_of_their_windows(found, log):
+    said = [opened(s)[2] for s in log if s.key == ch.INNOVATION.key("r1")]
+    submaps = [opened(s)[2] for s in log if s.key == ch.SUBMAP.key("r1")]
+    of_r1 = found.innovations["r1"]
+    assert of_r1.stamps_ns.tolist() == [s.stamp_ns for s in submaps]
+    assert of_r1.per_dof == sum(i.squared for i in said) / sum(i.dof for i in said)
+    assert of_r1.dof.sum() > 50
+    resumed = history([*log, *(s for s in log if s.key == ch.INNOVATION.key("r1"))])
+    assert resumed.innovations["r1"].per_dof == of_r1.per_dof
+
+
+def test_the_cost_and_the_nees_are_those_of_each_map(found, log):
+    keys = (ch.FUSED_MAP.key(), ch.FINAL_MAP.key())
+    maps = [opened(s)[2] for s in log if s.key in keys]
+    assert len(found.map_cost.values) == len([x for x in maps if x.dof])
+    assert found.map_cost.values[-1] == maps[-1].chi2 / maps[-1].dof
+    ids, means = translate.landmarks_of(maps[-1])
+    world = streams(scenario(robots=2))
+    true = dict(zip(world.landmark_ids.tolist(), world.landmarks, strict=True))
+    errors = [mean - true[i] for i, mean in zip(ids.tolist(), means, strict=True)]
+    e, P = np.concatenate(errors), translate.landmark_covariance_of(maps[-1])
+    assert maps[-1].joint
+    assert found.map_nees.values[-1] == pytest.approx(e @ np.linalg.solve(P, e) / len(e))
+    assert (np.diff(found.map_nees.stamps_ns) >= 0).all()
+
+
+def test_without_truth_there_is_the_cost_and_no_nees():
+    of = scenario()
+    hidden = (ch.TRUTH.key("r1"), ch.TRUTH_LANDMARKS.key())
+    blind = history([s for s in joined_log(of, 0.1) if s.key not in hidden])
+    assert len(blind.map_nees.values) == 0
+    assert blind.map_cost.values.tolist() == [1.5]
+    assert final_map([1], np.zeros((1, 2)), np.eye(2)).message.dof == 20

@@ -11,7 +11,6 @@ from teamslam.central.desk.report.run import Run
 from teamslam.central.desk.report.tables import summary_tables, team_rows
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.world.simulator import simulate
-from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.containment import Boundary
 from teamslam.team.shell import FaultyRunError, judge
 from teamslam.team.wire import channels as ch
@@ -58,9 +57,8 @@ def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothi
     def of_r2(final: m.FusedMap) -> m.FusedMap:
         why = ("r2 (incarnation 1) not joined: 0 shared landmarks, 2 needed",)
         members = tuple(each for each in final.members if each.robot != "r1")
-        return msgspec.structs.replace(
-            final, reasons=why, members=members, lost=("r3",), withdrawn=()
-        )
+        changes = {"reasons": why, "members": members, "lost": ("r3",), "withdrawn": ()}
+        return msgspec.structs.replace(final, **changes)
 
     result = evaluate(changed(samples, ch.FINAL_MAP, of_r2))
     assert {name: of.state for name, of in result.states.items()} == {
@@ -73,16 +71,13 @@ def test_a_robot_without_a_common_landmark_is_not_joined_and_one_that_sent_nothi
 def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_printed():
     of = scenario()
     streams = simulate(of.world, of.robots, of.seed)
-    streams = without_starts(streams, "r2", "r3")
+    first, *others = streams.streams
+    streams = replace(streams, streams=(first, *(replace(each, start=None) for each in others)))
     wrong = list(run_team(of, streams))
     order = build.withdrawal(reason="its wheel is flat")
     final = final_map(wrong)
-    gone = msgspec.structs.replace(
-        final,
-        frame="r2/1",
-        withdrawn=("r1",),
-        members=tuple(each for each in final.members if each.robot != "r1"),
-    )
+    members = tuple(each for each in final.members if each.robot != "r1")
+    gone = msgspec.structs.replace(final, frame="r2/1", withdrawn=("r1",), members=members)
     told = changed(wrong, ch.FINAL_MAP, lambda _: gone)
     told.append(Sample(ch.ORDER.key("r1"), encoded(order), 0, 0, 0))
     result = evaluate(told)
@@ -93,13 +88,6 @@ def test_errors_in_the_frame_that_a_withdrawn_robot_has_left_behind_are_not_prin
     assert "map NEES per dof" not in rows
     assert "landmarks within 95 %" not in rows
     assert result.robots["r1"].outside, "its poses are in the frame of its own start"
-
-
-def without_starts(streams: WorldStreams, *robots: str) -> WorldStreams:
-    return replace(
-        streams,
-        streams=tuple(replace(s, start=None) if s.robot in robots else s for s in streams.streams),
-    )
 
 
 def test_a_process_whose_final_map_is_without_a_withdrawn_robot_ends_with_1(samples):

@@ -1,9 +1,9 @@
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-import pytest
 
 from teamslam.central.desk import paths
 from teamslam.central.desk.evaluation.errors import Path as Poses
@@ -17,30 +17,30 @@ from teamslam.central.desk.export.take_home import (
     write_map,
     write_paths,
 )
+from teamslam.central.desk.left_out import is_kept, spans_left_out
 from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
 from teamslam.central.desk.verification.recorded import Recorded
-from teamslam.sim.in_memory.team import run_team
 from teamslam.team.datum import Datum
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.geodesy import local_from_geodetic
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
-from tests.sim.logs import scenario, streams
+from tests.central.test_diagnosis import TEAM, scenario
+from tests.sim.reruns import team_samples
+from tests.trials.stress_world import CarriedOff
 
 DATUM = Datum(48.745, 9.105, 400.0)
 
 
-@pytest.fixture(scope="module")
-def log():
-    of = scenario(robots=2)
-    return list(run_team(of, streams(of)))
-
-
 def recorded_of(samples: list[Sample]) -> Recorded:
     found = Recorded()
-    for sample in samples:
-        found.take(sample)
+    found.take_all(samples)
     return found
+
+
+def rows_of(table: Path) -> list[dict[str, str]]:
+    with table.open() as lines:
+        return list(csv.DictReader(lines))
 
 
 def test_a_path_has_every_keyframe_and_the_final_maps_ends(log):
@@ -99,8 +99,7 @@ def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
     home = take_home(recorded_of(log))
     fused = evaluate(log).map
     write_map(fused, home, tmp_path)
-    with (tmp_path / "map.csv").open() as lines:
-        rows = list(csv.DictReader(lines))
+    rows = rows_of(tmp_path / "map.csv")
     assert tuple(rows[0]) == MAP_COLUMNS
     assert [int(row["id"]) for row in rows] == fused.ids.tolist()
     assert [(float(row["x_m"]), float(row["y_m"])) for row in rows] == [
@@ -113,8 +112,7 @@ def test_the_tables_come_back_to_the_last_bit(log, tmp_path):
     for path in write_paths(home.paths, tmp_path / "paths"):
         lines = path.read_text().splitlines()
         assert len(lines) == 1 + len(home.paths[path.stem].stamps_ns)
-    with (tmp_path / "paths" / "r1.csv").open() as lines:
-        read = np.array([[float(v) for v in row] for row in list(csv.reader(lines))[1:]])
+    read = np.loadtxt(tmp_path / "paths" / "r1.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(read[:, 1:4], home.paths["r1"].poses)
     np.testing.assert_array_equal(read[:, 5], home.paths["r1"].covariances[:, 0, 1])
 
@@ -127,8 +125,7 @@ def test_a_map_beside_a_saved_one_has_each_landmarks_state(log, tmp_path):
         m.LandmarkChange(landmark=second, state="moved", dx=1.0),
     )
     write_map(replace(fused, changes=changes), TakenHome(), tmp_path)
-    with (tmp_path / "map.csv").open() as lines:
-        rows = list(csv.DictReader(lines))
+    rows = rows_of(tmp_path / "map.csv")
     assert [row["state"] for row in rows[:3]] == ["gone", "moved", ""]
     data = json.loads((tmp_path / "map.json").read_text())
     assert [each["state"] for each in data["landmarks"][:3]] == ["gone", "moved", None]
@@ -140,8 +137,7 @@ def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_pat
     fused = evaluate(log).map
     classes = {int(fused.ids[0]): ("tree", 0.75)}
     write_map(fused, replace(home, datum=DATUM, classes=classes), tmp_path)
-    with (tmp_path / "map.csv").open() as lines:
-        rows = list(csv.DictReader(lines))
+    rows = rows_of(tmp_path / "map.csv")
     assert (rows[0]["class"], rows[0]["class_probability"]) == ("tree", "0.75")
     assert rows[1]["class"] == ""
     degrees = [[float(row["latitude_deg"]), float(row["longitude_deg"])] for row in rows]
@@ -153,3 +149,42 @@ def test_a_map_with_a_datum_has_degrees_in_its_table_and_as_geojson(log, tmp_pat
     lines = [each for each in found["features"] if each["geometry"]["type"] == "LineString"]
     assert [each["properties"]["robot"] for each in lines] == ["r1", "r2"]
     assert len(lines[0]["geometry"]["coordinates"]) == len(home.paths["r1"].poses)
+
+
+# Parts of a path that are left out.
+
+
+S = 1_000_000_000
+
+
+def jump(at_s: int, place: tuple[float, ...] = ()) -> m.Diagnosis:
+    return m.Diagnosis(cause="carried_off", robot="r2", at_ns=at_s * S, place=place)
+
+
+def test_both_windows_beside_a_jump_are_left_out_with_the_pose_between_them():
+    ends = [s * S for s in range(10, 101, 10)]
+    stamps = np.arange(0, 101, 5) * S
+    spans = spans_left_out([jump(50)], "r2", ends)
+    assert (stamps[~is_kept(stamps, spans)] // S).tolist() == [45, 50, 55]
+    start = spans_left_out([jump(0)], "r2", ends)
+    assert (stamps[~is_kept(stamps, start)] // S).tolist() == [0, 5]
+    assert not spans_left_out([jump(50)], "r1", ends)
+    assert not spans_left_out([jump(50, (1.0, 2.0))], "r2", ends), "the stream is cut there"
+
+
+def test_the_path_has_no_poses_where_the_robot_was_carried_off(tmp_path):
+    off = CarriedOff("r2", 4.0, 0.6, 45.0)
+    samples = team_samples(scenario(replace(TEAM, carried_off=(off,)), tmp_path))
+    run = evaluate(samples)
+    path = smoothed_paths(recorded_of(samples))["r2"]
+    assert path.at_keyframes
+    gap = int(np.diff(path.stamps_ns).argmax())
+    begin, end = (path.stamps_ns[gap : gap + 2] * 1e-9).tolist()
+    assert begin < off.at_s < end
+    (note,) = (each for each in run.notes if "left out" in each)
+    assert note.startswith(f"r2's path from {begin:.1f} s to {end:.1f} s is left out: ")
+    truth = run.robots["r2"].truth
+    at = np.searchsorted(truth.stamps_ns, path.stamps_ns).clip(0, len(truth.stamps_ns) - 1)
+    away = path.poses[:, :2] - truth.poses[at, :2]
+    assert np.hypot(*away.T).max() < 1.0
+    assert run.robots["r2"].smoothed.errors[:, :2].max() < 0.5

@@ -16,8 +16,6 @@ import pytest
 from teamslam.central.desk.evaluation.errors import Path, trajectory_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.export.take_home import write_trajectories, write_tum
-from teamslam.sim.in_memory.team import run_team
-from tests.sim.logs import scenario, streams
 from tests.support import ROOT
 
 GOLDEN = ROOT / "tests" / "golden" / "evo.json"
@@ -91,9 +89,8 @@ def test_a_file_has_each_pose_with_its_nanoseconds_and_its_turn(tmp_path):
     np.testing.assert_allclose(np.cos(turns - poses[:, 2]), 1.0)
 
 
-def test_every_robots_paths_are_written_and_agree_with_the_figures(tmp_path):
-    of = scenario(robots=2)
-    run = evaluate(run_team(of, streams(of)))
+def test_every_robots_paths_are_written_and_agree_with_the_figures(log, tmp_path):
+    run = evaluate(log)
     written = write_trajectories(run, tmp_path)
     kinds = ("truth", "smoothed", "smoothed.truth", "online", "online.truth")
     assert {p.name for p in written} == {f"{r}.{k}.tum" for r in ("r1", "r2") for k in kinds}

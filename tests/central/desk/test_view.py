@@ -1,5 +1,7 @@
 import json
+import threading
 from collections import defaultdict
+from contextlib import nullcontext
 
 import jsonschema
 import numpy as np
@@ -7,37 +9,35 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from teamslam.central.desk.evaluation.errors import map_errors, transform_points
-from teamslam.central.desk.evaluation.running import RunningErrors, TrueLandmarks
-from teamslam.central.desk.view.drawn import (
-    centre_particles,
-)
-from teamslam.central.desk.view.export import export_views, with_views
+from teamslam.central.desk.evaluation.errors import transform_points
+from teamslam.central.desk.evaluation.running import RunningErrors
+from teamslam.central.desk.view.drawn import centre_particles
+from teamslam.central.desk.view.export import export_views, run_viewer, with_views
 from teamslam.central.desk.view.node import LAG_NS, PERIOD_NS, ViewerNode
-from teamslam.sim.in_memory.team import final_map, run_team
+from teamslam.sim.in_memory.team import final_map
 from teamslam.sim.scenarios.scenario import load, with_options
-from teamslam.sim.scenarios.source import streams_of
-from teamslam.team import translate
+from teamslam.team import end_query, translate
 from teamslam.team.recording.check import check_log
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
+from teamslam.team.shell import FaultyRunError
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire import views
 from teamslam.team.wire.arrays import from_floats
-from teamslam.team.wire.codec import decoded
+from teamslam.team.wire.bus import MemoryBus, MemoryNetwork
+from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.scenarios import with_world
-from tests.support import fused_map
+from tests.sim.reruns import team_samples
+from tests.support import example
 
 S = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
 def samples():
-    scenario = with_options(load("thesis"), seed=1)
-    scenario = with_world(scenario, steps=40)
-    return list(run_team(scenario, streams_of(scenario)))
+    return team_samples(with_world(with_options(load("thesis"), seed=1), steps=40))
 
 
 @pytest.fixture(scope="module")
@@ -162,21 +162,6 @@ def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
     np.testing.assert_allclose(found.nees, [1.0])
 
 
-def test_the_nees_of_a_joint_map_is_that_of_the_report():
-    P = np.diag([0.25, 1.0, 0.25, 1.0]) + 0.2
-    means = np.array([[1.0, 0.0], [5.5, 5.0]])
-    fused = fused_map(
-        ids=[4, 7], means=means.ravel(), covariance=translate.joint_bytes(P), joint=True
-    )
-    true = np.array([[0.0, 0.0], [5.0, 5.0]])
-    fit = TrueLandmarks(np.array([4, 7], np.uint32), true).fit(fused)
-    assert fit.nees_per_dof == pytest.approx(map_errors(means, P, true).nees_per_dof)
-    assert fit.nees_per_dof != pytest.approx(0.25 * (1.0 / 0.45 + 0.25 / 0.45))
-    of_one = TrueLandmarks(np.array([7], np.uint32), true[1:]).fit(fused)
-    e = means[1] - true[1]
-    assert of_one.nees_per_dof == pytest.approx(e @ np.linalg.solve(P[2:, 2:], e) / 2.0)
-
-
 # Time.
 
 
@@ -226,3 +211,24 @@ def test_a_cloud_is_drawn_around_the_robot_wherever_its_own_frame_has_drifted():
     mean = np.average(poses[:, :2], axis=0, weights=weights)
     placed = transform_points(np.array((*mean, heading)), seen)
     np.testing.assert_allclose(placed, poses[:, :2], atol=1e-12)
+
+
+# The end.
+
+
+@pytest.mark.parametrize("lost", [(), ("r2",)])
+def test_a_viewer_that_comes_after_the_end_leaves_and_says_what_is_wrong(lost, monkeypatch):
+    monkeypatch.setattr(end_query, "FINAL_S", 0.1)
+    final = example(m.FusedMap, final=True, lost=lost, withdrawn=())
+    kept = encoded(build.kept(key="central/final", payload=encoded(final)))
+    network = MemoryNetwork()
+    MemoryBus(network).answer(ch.KEPT, "", lambda _: [kept])
+    stop = threading.Event()
+    timer = threading.Timer(20.0, stop.set)
+    timer.start()
+    try:
+        with pytest.raises(FaultyRunError, match="r2 lost") if lost else nullcontext():
+            run_viewer(MemoryBus(network), stop)
+        assert not stop.is_set(), "it left by itself"
+    finally:
+        timer.cancel()

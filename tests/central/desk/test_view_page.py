@@ -2,16 +2,17 @@ import base64
 import json
 import re
 import socket
-from collections import defaultdict
+from collections import Counter, defaultdict
+from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import msgspec
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from websockets.exceptions import InvalidStatus
@@ -22,7 +23,7 @@ from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.view.export import with_views
 from teamslam.central.desk.view.layout import layout
 from teamslam.central.desk.view.node import ViewerNode
-from teamslam.central.desk.view.page_frames import PageFrames
+from teamslam.central.desk.view.page_frames import PageFrames, sets_of
 from teamslam.central.desk.view.server import (
     VIEWERS,
     Feed,
@@ -43,8 +44,9 @@ from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
+from tests.commands import output_of
 from tests.crowd import crowd
-from tests.support import ROOT, fused_map, wait_until
+from tests.support import ROOT, example, fused_map, wait_until
 
 ROBOTS, LANDMARKS, SECONDS = 3, 40, 60
 PAGE = ROOT / "central" / "desk" / "view" / "page"
@@ -104,35 +106,27 @@ def test_the_page_gets_every_pose_and_its_error(frames):
 
 
 def test_the_page_is_told_when_a_robots_poses_are_in_another_frame():
-    page = PageFrames()
-
-    def take(channel: ch.Channel, robot: str, message: m.Message) -> None:
-        sample = Sample(channel.key(robot), encoded(message), message.stamp_ns, 0, 0)
-        page.count(sample)
-        page.take(channel, message)
-
-    for robot in ("r1", "r2"):
-        start = build.initial_pose(robot=robot)
-        take(ch.START, robot, start)
+    messages = [(ch.START, build.initial_pose(robot=robot)) for robot in ("r1", "r2")]
     for second in range(4):
         for robot in ("r1", "r2"):
             own = second < 2
-            pose = build.pose_estimate(
-                stamp_ns=second * 10**9,
-                robot=robot,
-                pose=bytes(24),
-                covariance=np.eye(3),
-                frame=f"{robot}/1" if own else "r1/1",
-                in_team_frame=not own,
-            )
-            take(ch.OWN_POSE if own else ch.TEAM_POSE, robot, pose)
-    told = [json.loads(frame) for frame in page.flush()]
-    assert [(each["r"], each["t"]) for each in told if each["k"] == "frame"] == [("r2", 2.0)]
+            frame = f"{robot}/1" if own else "r1/1"
+            pose = at_origin(second, robot=robot, frame=frame, in_team_frame=not own)
+            messages.append((ch.OWN_POSE if own else ch.TEAM_POSE, pose))
+    told = [(each["r"], each["t"]) for each in told_of(*messages) if each["k"] == "frame"]
+    assert told == [("r2", 2.0)]
+
+
+def at_origin(second: int, **fields: object) -> m.PoseEstimate:
+    place = {"pose": np.zeros(3), "covariance": np.eye(3)}
+    return build.pose_estimate(stamp_ns=second * 10**9, **place, **fields)
 
 
 def told_of(*messages: tuple[ch.Channel, m.Message]) -> list[dict[str, object]]:
     page = PageFrames()
     for channel, message in messages:
+        name = getattr(message, "robot", getattr(message, "node", ""))
+        page.count(Sample(channel.key(name), encoded(message), message.stamp_ns, 0, 0))
         page.take(channel, message)
     return [json.loads(frame) for frame in page.flush()]
 
@@ -170,11 +164,13 @@ def test_the_page_is_told_what_a_node_waits_for_and_when_no_more():
     assert [each["x"] for each in told if each["k"] == "wait"] == [[waits], []]
 
 
-def test_a_running_map_without_cross_covariances_has_no_nees(frames):
-    *running, final = frames["map"]
-    assert {each["nees"] for each in running} == {None}
-    assert {each["rmse"] is None for each in running} == {False}
-    assert final["nees"] is not None
+def test_the_page_gets_the_members_of_a_landmark_and_the_steps_that_added_them():
+    count, words = sets_of(example(m.FusedMap))[2**31 + 7]
+    assert count == 2
+    assert words == [
+        "alpha/1/0/4",
+        "alpha/1/1/2: track, log-likelihood ratio 5.5, its best rival -2.0, sd 0.25 m",
+    ]
 
 
 @pytest.mark.parametrize("joint", [False, True])
@@ -203,24 +199,24 @@ def test_the_page_and_the_report_of_a_log_have_one_nees(samples, tmp_path, joint
 
 
 def test_the_page_gets_the_maps_and_how_they_fit(frames, samples):
-    maps = frames["map"]
-    assert len(maps) == sum(s.key in ("central/map", "central/final") for s in samples)
-    assert maps[-1]["final"]
-    assert len(np.frombuffer(base64.b64decode(maps[-1]["ids"]), "<u4")) == LANDMARKS
-    assert 0.05 < maps[-1]["rmse"] < 0.3
-    assert 0.5 < maps[-1]["nees"] < 2.0
+    """A running map without cross-covariances has no NEES."""
+    *running, final = frames["map"]
+    assert len(running) + 1 == sum(s.key in ("central/map", "central/final") for s in samples)
+    assert {each["nees"] for each in running} == {None}
+    assert all(each["rmse"] is not None for each in running)
+    assert final["final"]
+    assert len(np.frombuffer(base64.b64decode(final["ids"]), "<u4")) == LANDMARKS
+    assert 0.05 < final["rmse"] < 0.3
+    assert 0.5 < final["nees"] < 2.0
 
 
 def test_the_page_is_told_every_byte_by_key(frames, samples):
-    found = defaultdict(lambda: [0, 0])
+    found, said = Counter(), Counter()
     for frame in frames["bytes"]:
         for key, _, messages, size in frame["v"]:
-            found[key][0] += messages
-            found[key][1] += size
-    said = defaultdict(lambda: [0, 0])
+            found.update({(key, "messages"): messages, (key, "bytes"): size})
     for sample in samples:
-        said[sample.key][0] += 1
-        said[sample.key][1] += len(sample.payload)
+        said.update({(sample.key, "messages"): 1, (sample.key, "bytes"): len(sample.payload)})
     assert found == said
 
 
@@ -265,7 +261,9 @@ MAP_FROM_TRUTH = np.array([3.0, -2.0, 0.7])
 TRUE = np.array([[0.0, 0.0], [4.0, 1.0], [2.0, 5.0]])
 
 
-def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Channel, m.Message]]:
+def in_an_arbitrary_frame(
+    *, landmarks: bool = True, known: bool = False, at_ends: bool = False
+) -> list[tuple[ch.Channel, m.Message]]:
     heading = np.zeros((3, 1))
     true_path = np.hstack((TRUE + 1.0, heading))
     path = np.hstack((transform_points(MAP_FROM_TRUTH, TRUE + 1.0), heading + MAP_FROM_TRUTH[2]))
@@ -277,76 +275,66 @@ def in_an_arbitrary_frame(*, landmarks: bool, known: bool) -> list[tuple[ch.Chan
     )  # fmt: skip
     start = build.initial_pose(pose=from_floats(np.zeros(3)) if known else b"")
     truth = m.TruthLandmarks(stamp_ns=0, ids=from_ids([1, 2, 3]), positions=from_floats(TRUE))
+    crosses = np.zeros((3, 9)) if at_ends else b""
     return [
         (ch.START, start),
         *([(ch.TRUTH_LANDMARKS, truth)] if landmarks else []),
         (ch.TRUTH, build.truth(stamps=at, poses=true_path)),
-        (ch.TRAJECTORY, build.trajectory(stamps=at, poses=path)),
+        (ch.TEAM_POSE, at_origin(2, frame="r1/1")),
+        (ch.TRAJECTORY, build.trajectory(stamps=at, poses=path, crosses=crosses)),
         (ch.FINAL_MAP, fused),
     ]
 
 
+def entities_of(view: str, messages: list[tuple[ch.Channel, m.Message]]) -> dict[str, Any]:
+    """What Foxglove shows at last, by name."""
+    node = ViewerNode()
+    views = [each for message in messages for each in node.handle(*message)]
+    scenes = [SceneUpdate.FromString(each.payload) for each in views if each.key == view]
+    return {each.id: each for each in scenes[-1].entities}
+
+
+def places_of(shapes: Iterable[Any]) -> list[tuple[float, float]]:
+    return [(each.pose.position.x, each.pose.position.y) for each in shapes]
+
+
 @pytest.mark.parametrize("landmarks", [True, False])
 def test_the_truth_is_aligned_with_a_map_in_an_arbitrary_frame(landmarks):
-    told = told_of(*in_an_arbitrary_frame(landmarks=landmarks, known=False))
+    told = told_of(*in_an_arbitrary_frame(landmarks=landmarks))
     before, of_map = (each for each in told if each["k"] == "align")
     assert before == {"k": "align", "f": None, "v": None}
     assert of_map["f"] == next(each["f"] for each in told if each["k"] == "map") == "r1/1"
     assert of_map["v"] == pytest.approx(MAP_FROM_TRUTH)
 
 
-def test_the_truth_is_not_moved_in_its_own_frame():
-    told = told_of(*in_an_arbitrary_frame(landmarks=True, known=True))
+def test_the_truth_is_not_moved_in_its_own_frame_and_without_an_alignment_left_out():
+    told = told_of(*in_an_arbitrary_frame(known=True))
     assert not [each for each in told if each["k"] == "align"]
-
-
-def test_without_an_alignment_the_truth_is_left_out():
-    told = told_of(
-        *(each for each in in_an_arbitrary_frame(landmarks=False, known=False)
-          if each[0] is not ch.TRAJECTORY)
-    )  # fmt: skip
-    assert [each["v"] for each in told if each["k"] == "align"] == [None, None]
+    without = [
+        each for each in in_an_arbitrary_frame(landmarks=False) if each[0] is not ch.TRAJECTORY
+    ]
+    assert [each["v"] for each in told_of(*without) if each["k"] == "align"] == [None, None]
 
 
 @pytest.mark.parametrize(("known", "moved"), [(False, True), (True, False)])
 def test_foxgloves_true_landmarks_are_in_the_frame_of_the_map(known, moved):
-    node = ViewerNode()
-    pose = build.pose_estimate(
-        stamp_ns=2 * 10**9, frame="r1/1", pose=np.zeros(3), covariance=np.eye(3)
-    )  # fmt: skip
-    views = []
-    for channel, message in [
-        *in_an_arbitrary_frame(landmarks=True, known=known)[:3], (ch.TEAM_POSE, pose),
-        *in_an_arbitrary_frame(landmarks=True, known=known)[3:],
-    ]:  # fmt: skip
-        views += node.handle(channel, message)
-    scenes = [SceneUpdate.FromString(each.payload) for each in views if each.key == "view/map"]
-    true = next(each for each in scenes[-1].entities if each.id == "true landmarks")
-    places = [(cube.pose.position.x, cube.pose.position.y) for cube in true.cubes]
-    np.testing.assert_allclose(places, transform_points(MAP_FROM_TRUTH, TRUE) if moved else TRUE)
+    true = entities_of("view/map", in_an_arbitrary_frame(known=known))["true landmarks"]
+    expected = transform_points(MAP_FROM_TRUTH, TRUE) if moved else TRUE
+    np.testing.assert_allclose(places_of(true.cubes), expected)
 
 
 @pytest.mark.parametrize("at_ends", [True, False])
 def test_smoothed_poses_at_ends_of_submaps_are_dots_and_those_at_keyframes_a_line(at_ends):
-    *before, (channel, trajectory), last = in_an_arbitrary_frame(landmarks=True, known=False)
-    if at_ends:
-        trajectory = msgspec.structs.replace(trajectory, crosses=from_floats(np.zeros((3, 9))))
-    pose = build.pose_estimate(
-        stamp_ns=2 * 10**9, frame="r1/1", pose=np.zeros(3), covariance=np.eye(3)
-    )  # fmt: skip
-    log = [*before, (ch.TEAM_POSE, pose), (channel, trajectory), last]
+    log = in_an_arbitrary_frame(at_ends=at_ends)
     (path,) = (each for each in told_of(*log) if each["k"] == "path")
     assert path["ends"] is at_ends
-    node = ViewerNode()
-    views = [shown for channel, message in log for shown in node.handle(channel, message)]
-    scenes = [SceneUpdate.FromString(each.payload) for each in views if each.key == "view/paths"]
-    entities = {each.id: each for each in scenes[-1].entities}
+    entities = entities_of("view/paths", log)
     assert ("smoothed path r1" in entities) is not at_ends
     if at_ends:
-        dots = entities["smoothed poses r1"].cylinders
-        places = [(dot.pose.position.x, dot.pose.position.y) for dot in dots]
-        np.testing.assert_allclose(places, transform_points(MAP_FROM_TRUTH, TRUE + 1.0))
-        assert not entities["smoothed poses r1"].lines
+        dots = entities["smoothed poses r1"]
+        expected = transform_points(MAP_FROM_TRUTH, TRUE + 1.0)
+        np.testing.assert_allclose(places_of(dots.cylinders), expected)
+        assert not dots.lines
 
 
 def test_a_submap_and_a_prior_are_links_to_and_from_the_centre():
@@ -460,11 +448,10 @@ def test_the_stream_is_for_the_page_itself(shown):
 def test_a_port_that_is_taken_is_told_with_a_remedy(log):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
+        words = rf":{port}: Address already in use; choose another --"
         for ports in ((port, 0), (0, port)):
             with (
-                pytest.raises(
-                    ServerError, match=rf":{port}: Address already in use; choose another --"
-                ),
+                pytest.raises(ServerError, match=words),
                 session(log, "127.0.0.1", *ports, growing=False),
             ):
                 pass
@@ -555,10 +542,9 @@ def test_without_foxgloves_sdk_the_page_is_served_and_its_port_names_the_extra(l
         assert asked(shown, "/")[0] == 200
         assert shown.foxglove == ""
     monkeypatch.setattr(view, "find_spec", lambda _: None)
-    result = CliRunner().invoke(view.app, ["view", str(log), "--foxglove-port", "0"])
-    assert result.exit_code == 2
-    assert "--foxglove-port needs Foxglove's SDK" in result.output
-    assert "pip install" in result.output
+    said = output_of("view", log, "--foxglove-port", "0", status=2)
+    assert "--foxglove-port needs Foxglove's SDK" in said
+    assert "pip install" in said
 
 
 @pytest.mark.parametrize(
@@ -578,17 +564,12 @@ def test_foxgloves_proxy_checks_host_and_origin(at, host, origins, let_in):
     assert (refusal(at, host, origins, VIEWERS) is None) == let_in
 
 
-@pytest.fixture(scope="module")
-def kept(samples):
-    return [s for s in with_views(samples) if ch.VIEW.owner(s.key) is not None]
-
-
 # The layout.
 
 
-def test_the_layout_names_only_topics_that_there_are(kept):
+def test_the_layout_names_only_topics_that_there_are(samples):
     text = layout("crowd", ["r1", "r2", "r3"])
-    there = {f"team/crowd/{view.key}" for view in kept}
+    there = {f"team/crowd/{s.key}" for s in with_views(samples) if ch.VIEW.owner(s.key) is not None}
     named = set(re.findall(r"team/crowd/view/[\w/]+", text))
     optional = {f"team/crowd/view/particles/r{i}" for i in (1, 2, 3)}
     assert named - optional <= there

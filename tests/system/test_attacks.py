@@ -1,4 +1,5 @@
-"""An attacker with a robot's valid certificate harms that robot alone.
+"""An attacker with a robot's valid certificate harms that robot alone, and one without keys ends
+no process.
 
 The map stays that of an undisturbed team, no process ends, and the logs stay small.
 """
@@ -9,19 +10,22 @@ import os
 import signal
 import time
 from collections.abc import Callable
-from pathlib import Path
+from itertools import islice
+from random import Random
 
 import pytest
 
+from teamslam.sim.scenarios.scenario import load
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import nodes_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Outgoing, Sample
+from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from tests import build
+from tests.hostile.drawing import OF_THE_RUN, mutated, payloads
 from tests.support import example
 from tests.system.observer import endpoint_of
 from tests.system.processes import Processes, until
@@ -67,7 +71,8 @@ ATTACKS: tuple[Attack, ...] = (
 async def test_a_captured_robot_changes_no_bit_of_the_map(team: Processes, *, centre: bool) -> None:
     """The router is stopped as well, for longer than a handshake waits."""
     scenario, folder = short(team.folder), team.folder / "run"
-    keys = make_keys_of_team(team.folder)
+    keys = team.folder / "keys"
+    make_keys(keys, "short", nodes_of(["r1", "r2"]))
     launch = await team.start(
         *("launch", scenario, "--speed", "5", "--no-report", "--keys", keys),
         *("--output", folder, "--json", "result.json"),
@@ -96,6 +101,40 @@ async def test_a_captured_robot_changes_no_bit_of_the_map(team: Processes, *, ce
     assert {name: size for name, size in sizes.items() if size > LOG_BYTES} == {}
 
 
-def make_keys_of_team(folder: Path) -> Path:
-    make_keys(folder / "keys", "short", nodes_of(["r1", "r2"]))
-    return folder / "keys"
+MESSAGES = 500
+
+
+async def test_what_no_honest_node_says_ends_no_process_and_is_no_fault(team):
+    scenario = short(team.folder)
+    endpoint = await team.router()
+    there = ["--connect", endpoint]
+    started = [
+        await team.start("central", scenario, *there),
+        await team.start("robot", scenario, "r1", *there),
+    ]
+    for process in started:
+        await process.says("connected to team")
+    rng = Random(11)
+    unsaid = (*OF_THE_RUN, m.Fault, m.Status)  # only the last two are compared
+    storm = (each for each in payloads(rng) if each[0].message not in unsaid)
+    with ZenohBus(load(scenario).team, endpoint) as stranger:
+        for count, (channel, name, payload) in enumerate(islice(storm, MESSAGES)):
+            data = mutated(rng, payload) if count % 10 == 9 else payload
+            key = channel.key(name)
+            stranger.publish_raw(Sample(key, data, 0, time.time_ns(), count))
+        stranger.subscribe(ch.STATUS)
+        stranger.subscribe(ch.FAULT)
+        after: dict[str, int] = {}
+        faults: list[m.Message] = []
+
+        def all_speak() -> bool:
+            for sample in stranger.receive(0.1):
+                _, name, message = opened(sample)
+                if isinstance(message, m.Fault):
+                    faults.append(message)
+                after[name] = after.get(name, 0) + 1
+            return all(after.get(name, 0) >= 3 for name in ("central", "robot/r1"))
+
+        await until(all_speak, "every process says again how it is")
+    assert faults == []
+    assert [process.exit for process in started] == [None, None]
