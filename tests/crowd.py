@@ -25,15 +25,8 @@ def crowd(robots: int, landmarks: int, seconds: int, seed: int = 0) -> Iterator[
         return Sample(out.key, encoded(out.message), stamp_ns, stamp_ns, counter)
 
     names = [f"r{i}" for i in range(1, robots + 1)]
-    yield sample(
-        Outgoing(
-            ch.TRUTH_LANDMARKS,
-            "",
-            m.TruthLandmarks(
-                stamp_ns=0, ids=from_ids(range(landmarks)), positions=from_floats(places)
-            ),
-        )
-    )
+    true = {"ids": from_ids(range(landmarks)), "positions": from_floats(places)}
+    yield sample(Outgoing(ch.TRUTH_LANDMARKS, "", m.TruthLandmarks(stamp_ns=0, **true)))
     for name in names:
         yield sample(Outgoing(ch.ALIVE, f"robot/{name}", build.liveliness(node=f"robot/{name}")))
         yield sample(Outgoing(ch.START, name, build.initial_pose(robot=name, pose=[0, 0, 0])))

@@ -77,18 +77,10 @@ def test_what_does_not_fit_is_refused_with_its_reason_and_changes_nothing(there,
 
 
 def sighting(i, stamp=1, teammate="bravo", measurements=(3,)):
-    stamp_ns = i * 1_000_000 + stamp
+    name = {"robot": "alpha", "incarnation": 0, "sequence": i, "config": b"configur"}
+    seen = {"teammate": teammate, "range": 2.0, "bearing": 0.5, "covariance": packed(spd(2))}
     return build.sighting_factor(
-        stamp_ns=stamp_ns,
-        robot="alpha",
-        incarnation=0,
-        sequence=i,
-        config=b"configur",
-        teammate=teammate,
-        range=2.0,
-        bearing=0.5,
-        covariance=packed(spd(2)),
-        measurements=measurements,
+        stamp_ns=i * 1_000_000 + stamp, **name, **seen, measurements=measurements
     )
 
 

@@ -61,16 +61,8 @@ def test_pose_nodes_and_sightings_survive_the_wire_bit_for_bit():
     local = LocalMap(
         np.array([4], np.uint32), rng.normal(size=11), correlated(np.ones(11), rng), nodes
     )
-    message = translate.submap_message(
-        robot="r1",
-        incarnation=2,
-        sequence=5,
-        measurements=(1, 9),
-        span_ns=(1_000, 2_000),
-        config=b"settings",
-        local=local,
-        sightings=1,
-    )
+    span_ns = (1_000, 2_000)
+    message = translate.submap_message("r1", 2, 5, (1, 9), span_ns, b"settings", local, sightings=1)
     there = over_the_wire(message)
     found = translate.local_map_of(there)
     assert there.sightings == 1

@@ -16,7 +16,6 @@ from teamslam.central.withdrawal import Trial, disagreement, hold_trial
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.simulator import simulate
-from teamslam.team import translate
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.estimation.map_joining.condensed import SubmapCosts
 from teamslam.team.estimation.map_joining.joining import solve_fold
@@ -26,7 +25,7 @@ from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
 from teamslam.team.wire.bus import Outgoing, Sample, opened
-from tests.central.test_withdrawal import messages, of_set, scenario, team_run
+from tests.central.test_withdrawal import assert_map_without, messages, of_set, scenario, team_run
 from tests.scenarios import scenario_in
 from tests.sim.reruns import team_samples, written
 from tests.trials.stress_world import StressWorld, write
@@ -122,11 +121,7 @@ def test_a_liar_is_withdrawn_and_meanwhile_moves_nobody(liar, kind):
     final = final_map(list(samples))
     assert final.withdrawn == (liar,)
     assert [each.robot for each in messages(samples, m.Withdrawal)] == [liar]
-    never = of_set(samples, without=liar)
-    never.fold_until(math.inf)
-    found = landmark_map(solve_fold(never.fold, never.settings))
-    assert final.means == found.means.tobytes()
-    assert final.covariance == translate.joint_bytes(found.covariance)
+    assert_map_without(liar, final, samples)
     others = {"r1", "r2", "r3"} - {liar}
     errors = online_errors(samples, *others)
     assert len(errors) > 20

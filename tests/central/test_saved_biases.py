@@ -1,4 +1,5 @@
 import dataclasses
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -37,10 +38,6 @@ def days(seed, count, own=OWN, common=COMMON):
     return *found, starts, errors
 
 
-def two_days(seed, **options):
-    return days(seed, 2, **options)
-
-
 def fold_of(submaps, starts=()):
     return solve_fold(joined_with(submaps, starts, (), SETTINGS, len(submaps)), SETTINGS)
 
@@ -48,6 +45,13 @@ def fold_of(submaps, starts=()):
 def saved_map(fold, before=()):
     fused = example(m.FusedMap, ids=from_ids(NODES), changes=())
     return save_map(fold, fused, "site", {each.author: each for each in before}, [bytes(8)])
+
+
+@cache
+def first_day(seed=1):
+    """The saved map of the first of two days, and the second day's submaps."""
+    first, second, starts, _ = days(seed, 2)
+    return saved_map(fold_of(first, starts)), second
 
 
 def contribution(saved):
@@ -79,14 +83,17 @@ def raw(submaps, starts):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_saved_map_and_a_day_are_the_map_of_both_days_raw_submaps_with_the_errors_tied(seed):
-    first, second, starts, _ = two_days(seed)
+    first, second, starts, _ = days(seed, 2)
     saved = saved_map(fold_of(first, starts))
     island = fold_of([contribution(saved), *second]).main
     assert {stream[0] for stream in island.graph.streams} == {"map-site", "r0", "r1"}
-    mean, covariance = landmarks(island)
-    expected, spread = landmarks(raw([*first, *second], starts))
+    assert_same_landmarks(island, raw([*first, *second], starts), 0.15)
+
+
+def assert_same_landmarks(island, expected, sigmas):
+    (mean, covariance), (there, spread) = landmarks(island), landmarks(expected)
     sigma = np.sqrt(np.diag(spread))
-    assert (np.abs(mean - expected) < 0.15 * sigma).all()
+    assert (np.abs(mean - there) < sigmas * sigma).all()
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=0.1)
 
 
@@ -99,11 +106,7 @@ def test_on_the_third_day_the_errors_of_both_earlier_days_count_once(seed):
         assert len(getattr(of_second, field)) == len(getattr(of_first, field))
     island = fold_of([contribution(of_second), *third]).main
     expected = raw([*first, *second, *third], starts)
-    mean, covariance = landmarks(island)
-    there, spread = landmarks(expected)
-    sigma = np.sqrt(np.diag(spread))
-    assert (np.abs(mean - there) < 0.2 * sigma).all()
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), sigma, rtol=0.1)
+    assert_same_landmarks(island, expected, 0.2)
     for of, node in island.graph.biases.items():
         own, error = joint(island, [node], [])
         other, spread = joint(expected, [expected.graph.biases[of]], [])
@@ -112,8 +115,7 @@ def test_on_the_third_day_the_errors_of_both_earlier_days_count_once(seed):
 
 
 def test_an_old_file_without_errors_is_still_read_and_leaves_todays_less_sure():
-    first, second, starts, _ = two_days(1)
-    saved = saved_map(fold_of(first, starts))
+    saved, second = first_day()
     old = msgspec.structs.replace(saved, own=(), **dict.fromkeys(OF_OWN, b""))
     payload = msgspec.msgpack.encode(msgspec.msgpack.decode(encoded(old))[:14])
     assert decoded(payload, m.SavedMap) == old
@@ -126,8 +128,7 @@ def test_an_old_file_without_errors_is_still_read_and_leaves_todays_less_sure():
 
 
 def test_the_conditional_of_the_errors_is_the_saved_marginal():
-    first, _, starts, _ = two_days(2)
-    saved = saved_map(fold_of(first, starts))
+    saved, _ = first_day(2)
     own, plain = translate.own_biases_of(saved), translate.local_map_of(submap_of(saved))
     local, by_own = own.given(plain)
     P = local.covariance + by_own.T @ own.covariance @ by_own
@@ -136,8 +137,8 @@ def test_the_conditional_of_the_errors_is_the_saved_marginal():
 
 
 def test_a_sensor_that_was_replaced_loses_the_tie_and_is_named():
-    first, _, starts, _ = two_days(1, own=0.3, common=0.0)
-    _, second, _, errors = two_days(2, own=0.3, common=0.0)
+    first, _, starts, _ = days(1, 2, own=0.3, common=0.0)
+    _, second, _, errors = days(2, 2, own=0.3, common=0.0)
     fold = fold_of([contribution(saved_map(fold_of(first, starts))), *second])
     graph, weights = fold.main.graph, fold.main.estimate.prior_weights
     ties = {each.nodes[0]: k for k, each in enumerate(graph.priors) if len(each.nodes) == 2}
@@ -152,14 +153,12 @@ def test_a_sensor_that_was_replaced_loses_the_tie_and_is_named():
 
 def test_a_sensor_that_stayed_is_not_named():
     for seed in range(1, 4):
-        first, second, starts, _ = two_days(seed)
-        saved = contribution(saved_map(fold_of(first, starts)))
-        assert not list(sensor_warnings(fold_of([saved, *second])))
+        saved, second = first_day(seed)
+        assert not list(sensor_warnings(fold_of([contribution(saved), *second])))
 
 
 def test_another_robot_has_errors_of_its_own():
-    first, second, starts, _ = two_days(1)
-    saved = saved_map(fold_of(first, starts))
+    saved, second = first_day()
     others = [dataclasses.replace(each, robot=f"other_{each.robot}") for each in second]
     graph = fold_of([contribution(saved), *others]).main.graph
     assert {of[1] for of in graph.remembered} == {
@@ -171,8 +170,7 @@ def test_another_robot_has_errors_of_its_own():
 
 
 def test_the_errors_of_a_file_are_listed():
-    first, _, starts, _ = two_days(1)
-    shown = map_figures(saved_map(fold_of(first, starts)))["own"]
+    shown = map_figures(first_day()[0])["own"]
     assert [(each["robot"], each["bias"]) for each in shown] == [
         ("r0", "range_scale"),
         ("r1", "range_scale"),
@@ -190,7 +188,6 @@ def test_the_errors_of_a_file_are_listed():
     ],
 )
 def test_the_door_refuses_unsound_errors(fields, words):
-    first, _, starts, _ = two_days(1)
-    saved = msgspec.structs.replace(saved_map(fold_of(first, starts)), **fields)
+    saved = msgspec.structs.replace(first_day()[0], **fields)
     with pytest.raises(WireError, match=words):
         decoded(encoded(saved), m.SavedMap)

@@ -1,5 +1,4 @@
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -15,11 +14,8 @@ from tests.support import odometry, submap
 SENT = [Sample(ch.SUBMAP.key("alpha"), encoded(submap(i)), 0, 0, i) for i in range(3)]
 
 
-@contextmanager
-def a_life(path: Path) -> Iterator[StoredSet]:
-    kept = StoredSet(path)
-    yield kept
-    kept.close()
+def a_life(path: Path) -> closing[StoredSet]:
+    return closing(StoredSet(path))
 
 
 def heard(found: list[Sample] | list[Member]) -> list[tuple[str, bytes]]:

@@ -170,7 +170,11 @@ def test_a_robot_that_is_wrong_is_withdrawn_by_itself_and_exactly(wrong):
     (said,) = messages(samples, m.Withdrawal)
     assert not messages(samples, m.WithdrawalHeard), "no robot publishes another's order"
     assert (said.robot, said.by) == ("r3", "central")
-    never = of_set(samples, without="r3")
+    assert_map_without("r3", final, samples)
+
+
+def assert_map_without(robot: str, final: m.FusedMap, samples: tuple[Sample, ...]) -> None:
+    never = of_set(samples, without=robot)
     never.fold_until(math.inf)
     found = landmark_map(solve_fold(never.fold, never.settings))
     assert final.means == found.means.tobytes()
