@@ -103,8 +103,8 @@ def test_the_fold_by_ticks_is_the_fold_of_the_joined_submaps():
     for name, y in (("r1", 0.0), ("r2", 1.0)):
         start = translate.InitialPoseFactor(name, 1, np.array([0.0, y, 0.0]), None)
         fold = add_start(fold, start)
-    for tick in range(4):
-        part = [c for c in contributions if (c.end_ns - 1) // 4_000_000_000 == tick]
+    for number in range(4):
+        part = [c for c in contributions if (c.end_ns - 1) // 4_000_000_000 == number]
         fold = fold_submaps(fold, part, fresh().settings)
     assert bits(fold) == of_short()
 
