@@ -25,7 +25,8 @@ from teamslam.team.estimation.hybrid_slam.fastslam import (
     Particles,
     Proposal,
     StepInfo,
-    propagated_and_updated,
+    filter_step,
+    resampled,
 )
 from teamslam.team.estimation.hybrid_slam.fastslam import at_poses as particles_at
 from teamslam.team.estimation.map_joining import joining, marginals
@@ -160,17 +161,15 @@ def fastslam_step(
     Montemerlo 2003; Thrun et al. 2005, chapter 13.
     """
     taken = keyframe.calibrated(sensor)
-    return propagated_and_updated(
-        particles=particles,
-        increment=taken.increment,
-        sensor=sensor,
-        ids=taken.ids,
-        ranges=taken.ranges,
-        bearings=taken.bearings,
-        proposal=proposal,
-        resample_below=resample_below,
-        generator=generator,
+    seen = taken.ids, taken.ranges, taken.bearings
+    parents = None
+    if core.effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
+        particles, parents = resampled(particles, generator)
+    moved, log_evidence = filter_step(
+        particles, taken.increment, sensor, *seen, proposal, generator
     )
+    effective = core.effective_sample_size(moved.log_weights)
+    return moved, StepInfo(effective, parents, log_evidence)
 
 
 def submap_of(

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from teamslam.team.config import UNNAMED
+from teamslam.team.core import wrapped
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Bus, Sample
@@ -118,6 +119,13 @@ def _pump(source: socket.socket, sink: socket.socket, flows: threading.Event) ->
             flows.wait()
             sink.sendall(data)
         sink.shutdown(socket.SHUT_RDWR)
+
+
+def state_error(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Error of a state (x, y, theta, …), theta's in (−π, π]."""
+    error = estimate - truth
+    error[2] = wrapped(error[2])
+    return error
 
 
 def spd(n: int) -> np.ndarray:

@@ -18,15 +18,6 @@ MEDIAN_PRICE = 1.3
 """Ratio of the scatter of a χ² median of a few degrees of freedom to that of its mean."""
 
 
-def state_error(
-    estimate: Float[np.ndarray, " n"], truth: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
-    """Compute the error of a state (x [m], y [m], theta [rad], …), theta's in (−π, π]."""
-    error: Float[np.ndarray, " n"] = estimate - truth
-    error[2] += 2.0 * np.pi * np.floor((np.pi - error[2]) / (2.0 * np.pi))
-    return error
-
-
 def nees(error: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -> float:
     """Compute eᵀ P⁻¹ e, χ² with n degrees of freedom. Raises NotACovarianceError."""
     L = cholesky_factor(covariance, "an estimation error")

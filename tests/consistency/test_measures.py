@@ -10,11 +10,11 @@ from teamslam.team.estimation.consistency import (
     covariance_scale,
     coverage,
     nees,
-    state_error,
 )
 from teamslam.team.estimation.gaussian import NotACovarianceError
 from teamslam.team.estimation.map_joining.conditioning import GATE
 from teamslam.team.estimation.map_joining.nonlinearity import UNLIKELY
+from tests.support import state_error
 
 L = np.array([[0.5, 0.0, 0.0], [0.3, 0.2, 0.0], [-0.1, 0.4, 0.1]])
 

@@ -3,10 +3,11 @@ import pytest
 from scipy.stats import chi2
 
 from teamslam.team.config import MotionModel, MotionNoise, Sensor
-from teamslam.team.estimation.consistency import nees, state_error
+from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.hybrid_slam import window as windows
 from tests.consistency import RIGHT, TOO_LARGE, TOO_SMALL, judge
 from tests.estimation.hybrid_slam.test_window import ACCURATE, COARSE, STEP_M, drive, driven
+from tests.support import state_error
 
 
 def submap_errors(sensor, particles, runs, **options):

@@ -16,11 +16,12 @@ from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.estimation.se2 import between, inverse, transformed
 from teamslam.team.wire import messages as m
+from tests.support import state_error
 
 PROBABILITY = 0.999
 WINDOW_S = 8.0

@@ -12,7 +12,7 @@ import numpy as np
 
 from teamslam.team import core
 from teamslam.team.config import Sensor
-from teamslam.team.core import effective_sample_size, systematic_parents
+from teamslam.team.core import systematic_parents
 from teamslam.team.estimation.gaussian import CoreErrors
 from teamslam.team.estimation.models import Increment, Own, noise_of
 from teamslam.team.shapes import Float, Int64, UInt32
@@ -87,34 +87,6 @@ def resampled(
     return copies, parents
 
 
-def propagated_and_updated(
-    particles: Particles,
-    increment: Increment,
-    sensor: Sensor,
-    ids: UInt32[np.ndarray, " n"],
-    ranges: Float[np.ndarray, " n"],
-    bearings: Float[np.ndarray, " n"],
-    proposal: Proposal,
-    resample_below: float,
-    generator: "np.random.Generator",
-    own: Own | None = None,
-) -> tuple[Particles, StepInfo]:
-    """Resample if the particles are thin, move them, then update them by the measurements.
-
-    Resampling, below an effective sample size of `resample_below`·M, comes first, so a window's
-    last step keeps its weights. ranges [m] and bearings [rad] are calibrated; own: their
-    covariances (`teamslam.team.estimation.models`); an id may occur twice. Draws M × 3 normal
-    numbers, and one uniform one if it resamples. Raises NotACovarianceError.
-    """
-    parents = None
-    if effective_sample_size(particles.log_weights) < resample_below * len(particles.poses):
-        particles, parents = resampled(particles, generator)
-    moved, log_evidence = filter_step(
-        particles, increment, sensor, ids, ranges, bearings, proposal, generator, own=own
-    )
-    return moved, StepInfo(effective_sample_size(moved.log_weights), parents, log_evidence)
-
-
 def filter_step(
     particles: Particles,
     increment: Increment,
@@ -127,7 +99,11 @@ def filter_step(
     *,
     own: Own | None = None,
 ) -> tuple[Particles, float]:
-    """As `propagated_and_updated` without resampling; return also the log evidence."""
+    """Move the particles, then update them by the measurements; return also the log evidence.
+
+    ranges [m] and bearings [rad] are calibrated; own: their covariances (`models.Own`); an id may
+    occur twice. Draws M × 3 normal numbers. Raises NotACovarianceError.
+    """
     normals = generator.standard_normal((len(particles.poses), 3))
     with CoreErrors():
         window = core.Window.of_particles(

@@ -8,6 +8,7 @@ from teamslam.team.config import Sensor
 from teamslam.team.core import moments
 from teamslam.team.estimation.hybrid_slam import fastslam
 from teamslam.team.estimation.models import Increment, Noise
+from teamslam.team.library import Keyframe, fastslam_step
 from tests.estimation.submap_world import wrap
 
 quick = settings(deadline=None, max_examples=60)
@@ -100,16 +101,10 @@ def filtered(motions, keyframes, count, proposal, resample_below=0.5, seed=0):
     particles, log_evidence, infos = fastslam.at_poses(np.zeros((count, 3))), 0.0, []
     for motion, measurements in zip(motions, keyframes, strict=True):
         z = np.array([measurement for _, measurement in measurements])
-        particles, info = fastslam.propagated_and_updated(
-            particles=particles,
-            increment=motion,
-            sensor=SENSOR,
-            ids=IDS[[k for k, _ in measurements]],
-            ranges=z[:, 0].copy(),
-            bearings=z[:, 1].copy(),
-            proposal=proposal,
-            resample_below=resample_below,
-            generator=rng,
+        ids = IDS[[k for k, _ in measurements]]
+        keyframe = Keyframe(increment=motion, ids=ids, ranges=z[:, 0], bearings=z[:, 1])
+        particles, info = fastslam_step(
+            particles, keyframe, SENSOR, rng, proposal=proposal, resample_below=resample_below
         )
         log_evidence += info.log_evidence
         infos.append(info)
@@ -151,17 +146,9 @@ def test_from_equal_particles_the_second_proposal_leaves_equal_weights():
     truth = moved(np.concatenate((np.zeros(3), LANDMARKS.ravel())), MOTION.mean)
     shift = np.array([[0.1, -0.2], [0.1, 0.2], [-0.2, 0.1]])
     z = np.array([observed(truth, k) for k in range(3)]) + shift * [1.0, 0.01]
-    after, info = fastslam.propagated_and_updated(
-        particles=known,
-        increment=Increment(MOTION.mean, root @ root.T),
-        sensor=SENSOR,
-        ids=IDS,
-        ranges=z[:, 0].copy(),
-        bearings=z[:, 1].copy(),
-        proposal="fastslam2",
-        resample_below=0.5,
-        generator=rng,
-    )
+    motion = Increment(MOTION.mean, root @ root.T)
+    keyframe = Keyframe(increment=motion, ids=IDS, ranges=z[:, 0], bearings=z[:, 1])
+    after, info = fastslam_step(known, keyframe, SENSOR, rng)
     assert info.effective_sample_size > (1.0 - 3e-5) * count
     assert np.std(after.poses[:, 2]) < 0.5 * np.linalg.norm(root[2])
 

@@ -11,12 +11,13 @@ from scipy.optimize import least_squares
 
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
 from teamslam.team.core import POSE_JITTER, moments
-from teamslam.team.estimation.consistency import nees, state_error
+from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.window import random_numbers
 from teamslam.team.estimation.models import Increment, increment_of
 from tests.estimation.submap_world import wrap
+from tests.support import state_error
 
 STEP_M, STEP_RAD = 0.05, np.deg2rad(3.0)
 ROBOT = MotionModel(

@@ -10,12 +10,13 @@ from teamslam.sim.studies.estimators import ekf_slam
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team.config import Sensor
-from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.gaussian import NotACovarianceError, cholesky_factor
 from teamslam.team.estimation.hybrid_slam.window import NOTHING
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.submap_world import wrap
+from tests.support import state_error
 
 SENSOR = Sensor(range_sigma=0.2, range_sigma_per_m=0.01, bearing_sigma=0.03)
 STANDING = Increment.identity()

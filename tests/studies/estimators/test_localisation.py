@@ -8,11 +8,12 @@ from teamslam.sim.studies.estimators import localisation
 from teamslam.sim.studies.estimators.robot_step import RobotStep
 from teamslam.team import core
 from teamslam.team.config import Sensor
-from teamslam.team.estimation.consistency import chi2_interval, nees, state_error
+from teamslam.team.estimation.consistency import chi2_interval, nees
 from teamslam.team.estimation.hybrid_slam.window import NOTHING
 from teamslam.team.estimation.models import Increment
 from teamslam.team.estimation.se2 import compose, exponential
 from tests.estimation.submap_world import wrap
+from tests.support import state_error
 
 IDS = np.array([2, 5, 9], np.uint32)
 LANDMARKS = np.array([[9.0, 2.0], [-4.0, 7.0], [1.0, -8.0]])
