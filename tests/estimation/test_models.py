@@ -195,20 +195,20 @@ def test_a_base_that_veers_turns_by_the_way_that_it_drove_on_top_of_what_is_logg
 )
 def test_the_sensors_jacobians_are_those_of_central_differences(x, y, theta, distance, bearing):
     pose = np.array([x, y, theta])
-    landmark = models.located(pose, distance, bearing)
-    np.testing.assert_allclose(models.predicted(pose, landmark), (distance, bearing), atol=1e-9)
+    landmark = core.located(pose, distance, bearing)
+    np.testing.assert_allclose(core.predicted(pose, landmark), (distance, bearing), atol=1e-9)
     expected, by_pose, by_landmark = core.predict(pose, landmark[None])
-    np.testing.assert_array_equal(expected[0], models.predicted(pose, landmark))
+    np.testing.assert_array_equal(expected[0], core.predicted(pose, landmark))
     for column in range(3):
         xi = 1e-6 * (np.arange(3) == column)
-        ahead = models.predicted(compose(pose, exponential(xi)), landmark)
-        behind = models.predicted(compose(pose, exponential(-xi)), landmark)
+        ahead = core.predicted(compose(pose, exponential(xi)), landmark)
+        behind = core.predicted(compose(pose, exponential(-xi)), landmark)
         numeric = np.subtract(ahead, behind) / 2e-6
         np.testing.assert_allclose(by_pose[0, :, column], numeric, atol=1e-6)
     for column in range(2):
         shift = 1e-6 * (np.arange(2) == column)
-        ahead = models.predicted(pose, landmark + shift)
-        behind = models.predicted(pose, landmark - shift)
+        ahead = core.predicted(pose, landmark + shift)
+        behind = core.predicted(pose, landmark - shift)
         numeric = np.subtract(ahead, behind) / 2e-6
         np.testing.assert_allclose(by_landmark[0, :, column], numeric, atol=1e-6)
 
