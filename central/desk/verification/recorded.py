@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from typing import TypeVar
 
 import msgspec
@@ -55,6 +56,16 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         """Least and greatest stamp."""
         stamps = [each.stamp_ns for each in self._messages.values()]
         return min(stamps), max(stamps)
+
+    @property
+    def last(self) -> int:
+        """Greatest number."""
+        return max(self._messages)
+
+    def steps(self, end: int) -> list[int]:
+        """Count the odometry intervals before each of the measurements 0 … end."""
+        get = self._messages.get
+        return [0, *accumulate(type(get(number)) in m.ODOMETRY for number in range(end))]
 
     def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement]:
         """Yield measurements begin … end − 1, up to the first gap."""

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from itertools import accumulate, takewhile
+from itertools import takewhile
 from typing import Any
 
 from teamslam.central.desk.verification.recorded import (
@@ -144,9 +144,8 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
 
 def _first_of(done: m.Done, chain: Sequence[m.Submap], measurements: RecordedMeasurements) -> int:
     """Number of a process's first measurement: `done.steps` odometry intervals before its last."""
-    last = min(done.measurements, max(measurements) + 1)
-    is_step = (isinstance(measurements.get(n), m.AnyOdometry) for n in range(last))
-    steps = [0, *accumulate(is_step)]
+    last = min(done.measurements, measurements.last + 1)
+    steps = measurements.steps(last)
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in sorted((each for each in begins if each <= last), reverse=True):
         if steps[last] - steps[counter] == done.steps:
@@ -164,7 +163,7 @@ def _life(
     start = measurements.get(0)
     if not isinstance(start, m.InitialPose):
         return
-    last = max(measurements) + 1 if until is None else until
+    last = measurements.last + 1 if until is None else until
     while True:
         node = new()
         if first:

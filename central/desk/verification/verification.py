@@ -317,7 +317,7 @@ def _gap(log: Recorded, message: m.Message) -> str | None:
         if stream[0] != robot or incarnation not in {None, stream[1]}:
             continue
         there = log.measurements[stream]
-        lost = next((n for n in range(max(there)) if n not in there), None)
+        lost = next((n for n in range(there.last) if n not in there), None)
         before = None if lost is None else there.get(lost - 1)
         if lost is not None and (before is None or before.stamp_ns <= message.stamp_ns):
             return f"measurement {lost} is not in the log"
