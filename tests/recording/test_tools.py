@@ -320,6 +320,8 @@ def test_two_parts_of_a_log_merge_to_the_log_in_time_order(tmp_path_factory, at_
             assert not 0 < at_ns <= 59 * SECOND // 10
         else:
             parts.append(open_log(folder / f"{name}.mcap"))
+            stamps = [s.stamp_ns - 100 * SECOND for s in parts[-1].samples([c.ODOMETRY])]
+            assert all((stamp < at_ns) == (name == "a") or stamp == at_ns for stamp in stamps)
     merged = merge(parts, folder / "m.mcap")
     again = open_log(folder / "m.mcap")
     assert list(again.samples()) == sorted(log.samples(), key=lambda s: s.stamp_ns)
