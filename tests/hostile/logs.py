@@ -80,10 +80,11 @@ def far_counters(path: Path) -> Path:
     counts = {"first_measurement": 0, "last_measurement": far}
     map_ = {"ids": [1], "mean": joint, "covariance": packed(spd(5))}
     submap = build.submap(stamp_ns=9, robot="alpha", start_ns=1, config=DIGEST, **counts, **map_)
+    of_alpha = {"robot": "alpha", "duration_ns": 5}
     told: list[tuple[ch.Channel, str, m.Message]] = [
         (ch.START, "alpha", build.initial_pose(robot="alpha")),
         *(
-            (ch.ODOMETRY, "alpha", build.odometry(stamp_ns=at, robot="alpha", number=number))
+            (ch.ODOMETRY, "alpha", build.odometry(stamp_ns=at, **of_alpha, number=number))
             for at, number in ((5, 1), (2**61, far))
         ),
         (ch.SUBMAP, "alpha", submap),
