@@ -6,7 +6,6 @@ part in one step, so a crash neither loses nor repeats samples.
 
 import logging
 import os
-import secrets
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -92,7 +91,7 @@ def next_part(path: Path, team: str, metadata: Mapping[str, str]) -> tuple[Recor
     if earlier and shutil.disk_usage(path.parent).free < ROOM:
         raise RecorderError(f"{path}: the disk is full; make room")
     before = next((log for log in parts.opened.values() if log is not None), None)
-    log_id = secrets.token_hex(8) if before is None else before.metadata.get(LOG_ID)
+    log_id = os.urandom(8).hex() if before is None else before.metadata.get(LOG_ID)
     named = {} if log_id is None else {LOG_ID: log_id}
     part = part_of(path, parts.next_number)
     try:
