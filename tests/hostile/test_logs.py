@@ -29,7 +29,7 @@ def test_no_command_lets_a_small_file_take_much_memory_or_end_in_a_traceback(tmp
     }
     assert max(growth.values()) < MOST_MIB, growth
     refused = found["expands"]
-    assert "which no recorder writes" in refused["info"][2]
+    assert "which no recorder writes" in refused["check"][2]
     assert all(refused[n][0] == 2 for n in ("report", "rerun", "replay", "csv", "ledger", "view"))
 
 
