@@ -56,7 +56,7 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
         message: Any = _decoder(expected).decode(payload)
     except (WireError, *_UNREADABLE) as error:
         raise _refusal(payload, expected, error) from None
-    if type(message) in _OF_ROBOTS and not _is_name(message.robot):
+    if type(message) in _OF_ROBOTS and not _is_name(message.robot[:LONGEST]):
         raise WireError("wrong field", f"{type(message).__name__}: {_NO_NAME}")
     try:
         message.check()
@@ -70,6 +70,9 @@ def decoded(payload: bytes, *expected: type[M]) -> M:
 _OF_ROBOTS = frozenset(k for k in BY_TAG.values() if issubclass(k, Measurement | PoseEstimate))
 """Messages whose field `robot` is a `Robot`."""
 _NO_NAME = f"Expected `str` matching regex {NAME!r} - at `$[2]`"
+
+
+LONGEST = 33  # characters of a name that are read, one more than it has
 
 
 @lru_cache(maxsize=1024)

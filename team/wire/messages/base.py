@@ -12,7 +12,7 @@ from teamslam.team.wire.arrays import floats, ids
 
 NAME = "^[a-z][a-z0-9_]{0,31}$"
 Name = Annotated[str, Meta(pattern=NAME)]
-Robot = Annotated[str, Meta(max_length=32, extra_json_schema={"pattern": NAME})]
+Robot = Annotated[str, Meta(extra_json_schema={"pattern": NAME})]
 """A `Name` of frequent messages, checked by `codec.decoded`: msgspec's own check of a pattern takes
 twice as long as all other fields together.
 """
