@@ -10,7 +10,7 @@ from typing import Any
 
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.verification.recorded import Recorded, RerunError
-from teamslam.central.desk.verification.robot import dispositions
+from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team.rejection import REJECTED
 from teamslam.team.robot.ledger import IN_SIGHTING
 from teamslam.team.store import Stream
@@ -185,33 +185,36 @@ def _entries(
         )
     holder: list[int | None] = [None] * count
     wrong = []
-    for submap in submaps:
-        for counter in range(submap.first_measurement, submap.last_measurement + 1):
+    for each in submaps:
+        for counter in range(each.first_measurement, each.last_measurement + 1):
             if counter >= count:
-                name = f"submap {submap.sequence} of {_name(stream)}"
+                name = f"submap {each.sequence} of {_name(stream)}"
                 wrong.append(f"{name} uses measurement {counter}, which the log does not have")
                 break
             if holder[counter] is not None:
                 wrong.append(
                     f"measurement {counter} of {_name(stream)} is in two submaps: "
-                    f"{holder[counter]} and {submap.sequence}"
+                    f"{holder[counter]} and {each.sequence}"
                 )
-            holder[counter] = submap.sequence
-    disposition_of = dispositions(log, *stream)
+            holder[counter] = each.sequence
+    computed = run_alone(log, *stream).dispositions
     last = max((s.last_measurement for s in submaps), default=-1)
     consumed = log.reported.get(stream, 0)
     entries = []
     for counter in range(count):
-        name = f"measurement {counter} of {_name(stream)}"
-        in_submap = counter in measurements and holder[counter] is not None
-        disposition = disposition_of.get(counter, IN_SUBMAP if in_submap else LOST)
-        if counter not in measurements and holder[counter] is not None:
-            wrong.append(f"{name} is in submap {holder[counter]}, but not in the log")
-        elif disposition in (IN_SUBMAP, IN_SIGHTING) and holder[counter] is None:
+        submap = holder[counter]
+        disposition = IN_SUBMAP if counter in measurements and submap is not None else LOST
+        if counter < len(computed):
+            disposition = computed[counter]
+        if counter not in measurements and submap is not None:
+            name = f"measurement {counter} of {_name(stream)}"
+            wrong.append(f"{name} is in submap {submap}, but not in the log")
+        elif disposition in (IN_SUBMAP, IN_SIGHTING) and submap is None:
             if counter < last:
+                name = f"measurement {counter} of {_name(stream)}"
                 wrong.append(f"{name} is behind its submaps and in none of them")
             disposition = OPEN if counter < consumed else LOST
-        entries.append(Entry(disposition, holder[counter]))
+        entries.append(Entry(disposition, submap))
     return tuple(entries), wrong
 
 

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from teamslam.central.desk.left_out import is_kept, spans_left_out
-from teamslam.central.desk.verification.recorded import Recorded, RerunError
+from teamslam.central.desk.verification.recorded import Recorded, RecordedWindow, RerunError
 from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team import translate
-from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
-from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed, window_path
+from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -65,16 +64,15 @@ def smoothed_paths(
     return paths
 
 
-def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, ClosedWindow]:
-    closed: list[ClosedWindow] = []
+def _windows(found: Recorded, robot: str, incarnation: int) -> Mapping[int, RecordedWindow]:
     with suppress(RerunError):
         if found.robot_config(robot)[0].estimator == "hybrid":
-            run_alone(found, robot, incarnation, on_window=closed.append)
-    return {window.end_ns: window for window in closed}
+            return run_alone(found, robot, incarnation).windows
+    return {}
 
 
 def _between_ends(
-    found: Recorded, message: m.Trajectory, windows: Mapping[int, ClosedWindow]
+    found: Recorded, message: m.Trajectory, windows: Mapping[int, RecordedWindow]
 ) -> SmoothedPath:
     stamps, poses = translate.trajectory_of(message)
     covariances = floats(message.covariances, "covariances").reshape(-1, 3, 3)
@@ -88,8 +86,8 @@ def _between_ends(
     parts = [] if first is None else [(np.array([first.start_ns]), before[None], spread[None])]
     for stamp, pose, covariance, cross in zip(stamps, poses, covariances, crosses, strict=True):
         closed = windows.get(int(stamp))
-        if closed is not None and closed.window is not None and closed.keyframes_ns:
-            path = window_path(closed.window, closed.keyframes_ns)
+        path = None if closed is None else closed.path
+        if path is not None:
             ends = Ends(before, pose, np.block([[spread, cross.T], [cross, covariance]]))
             within = path.stamps_ns < stamp
             placed_poses, placed_covariances = placed(path, ends, factor)

@@ -5,13 +5,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 
 from teamslam.central.config import UNREADABLE, CentralConfig
 from teamslam.central.desk.names import in_order
 from teamslam.team.config import RobotConfig
+from teamslam.team.estimation.hybrid_slam.window_path import WindowPath
 from teamslam.team.former_names import with_current_names
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.store import Stream
@@ -85,11 +86,25 @@ class RecordedOutput:
     message: m.Message
 
 
+class RecordedWindow(NamedTuple):
+    """Start of a recomputed window, and its path if it was solved."""
+
+    start_ns: int
+    path: WindowPath | None
+
+
+class RunAlone(NamedTuple):
+    """Dispositions of the consumed measurements by number, and closed windows by end [ns]."""
+
+    dispositions: Sequence[str]
+    windows: Mapping[int, RecordedWindow]
+
+
 class Recorded:
     """All node inputs and outputs in a log; each measurement once.
 
     outputs: recomputable messages by channel. reported: consumed by the robot's report. published:
-    announced by the source. withdrawals: first order on each robot.
+    announced by the source. withdrawals: first order on each robot. alone: results of `run_alone`.
     """
 
     def __init__(self) -> None:
@@ -101,6 +116,7 @@ class Recorded:
         self.known_map: m.KnownMap | None = None
         self.saved_maps: dict[str, m.SavedMap] = {}
         self.withdrawals: dict[str, m.Withdrawal] = {}
+        self.alone: dict[Stream, RunAlone] = {}
         self.unsound = 0
 
     def take_all(self, samples: Sequence[Sample]) -> None:

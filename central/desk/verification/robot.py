@@ -9,10 +9,14 @@ from teamslam.central.desk.verification.recorded import (
     Identity,
     Recorded,
     RecordedMeasurements,
+    RecordedWindow,
+    RunAlone,
     identity,
 )
 from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary
+from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
+from teamslam.team.estimation.hybrid_slam.window_path import window_path
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.registry import load
 from teamslam.team.robot.node import robot_node
@@ -182,9 +186,29 @@ def _life(
         first = following
 
 
-def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> int:
-    """Run a robot's node, without a centre, over an incarnation; return how many it consumed."""
-    node = _RecomputedRobot(*log.robot_config(robot), {}, **options)
+def run_alone(log: Recorded, robot: str, incarnation: int) -> RunAlone:
+    """Run a robot's node, without a centre, over an incarnation; once per log."""
+    stream = robot, incarnation
+    if stream not in log.alone:
+        log.alone[stream] = _run_alone(log, robot, incarnation)
+    return log.alone[stream]
+
+
+def _run_alone(log: Recorded, robot: str, incarnation: int) -> RunAlone:
+    disposition_of: dict[int, str] = {}
+    windows: dict[int, RecordedWindow] = {}
+
+    def on_window(closed: ClosedWindow) -> None:
+        path = None
+        if closed.window is not None and closed.keyframes_ns:
+            path = window_path(closed.window, closed.keyframes_ns)
+        windows[closed.end_ns] = RecordedWindow(closed.start_ns, path)
+
+    config, digest = log.robot_config(robot)
+    options: dict[str, Any] = {"on_disposition": disposition_of.__setitem__}
+    if config.estimator == "hybrid":
+        options["on_window"] = on_window
+    node = _RecomputedRobot(config, digest, {}, (), **options)
     node.take_known_map(log)
     node.given(m.Liveliness(stamp_ns=0, node="central", alive=False))
     measurements = log.measurements.get((robot, incarnation), RecordedMeasurements())
@@ -196,11 +220,4 @@ def run_alone(log: Recorded, robot: str, incarnation: int, **options: Any) -> in
     if consumed and done is not None:
         end = m.StreamEnd(robot=robot, incarnation=incarnation, measurements=consumed)
         node.given(m.End(stamp_ns=0, streams=(end,)))
-    return consumed
-
-
-def dispositions(log: Recorded, robot: str, incarnation: int) -> dict[int, str]:
-    """Disposition of each consumed measurement of an incarnation."""
-    disposition_of: dict[int, str] = {}
-    consumed = run_alone(log, robot, incarnation, on_disposition=disposition_of.__setitem__)
-    return {counter: disposition_of.get(counter, "lost") for counter in range(consumed)}
+    return RunAlone([disposition_of.get(number, "lost") for number in range(consumed)], windows)

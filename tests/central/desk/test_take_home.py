@@ -19,9 +19,8 @@ from teamslam.central.desk.export.take_home import (
 )
 from teamslam.central.desk.left_out import is_kept, spans_left_out
 from teamslam.central.desk.paths import SmoothedPath, smoothed_paths
-from teamslam.central.desk.verification.recorded import Recorded
+from teamslam.central.desk.verification.recorded import Recorded, RecordedWindow
 from teamslam.team.datum import Datum
-from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
 from teamslam.team.geodesy import local_from_geodetic
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
@@ -57,12 +56,13 @@ def test_a_path_has_every_keyframe_and_the_final_maps_ends(log):
 def test_a_keyframe_at_a_windows_start_is_not_a_second_pose_of_that_stamp(log, monkeypatch):
     """A window that ends with a scan leaves it to the next one, whose first keyframe it is."""
 
-    def windows(*of) -> dict[int, ClosedWindow]:
-        return {
-            end_ns: replace(closed, keyframes_ns=(closed.start_ns, *closed.keyframes_ns[1:]))
-            for end_ns, closed in computed(*of).items()
-            if closed.keyframes_ns
-        }
+    def windows(*of) -> dict[int, RecordedWindow]:
+        found = {}
+        for end_ns, (start_ns, path) in computed(*of).items():
+            if path is not None:
+                stamps_ns = np.concatenate([[start_ns], path.stamps_ns[1:]])
+                found[end_ns] = RecordedWindow(start_ns, replace(path, stamps_ns=stamps_ns))
+        return found
 
     computed = paths._windows
     monkeypatch.setattr(paths, "_windows", windows)
