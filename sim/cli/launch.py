@@ -325,9 +325,9 @@ def _keep_earlier(log: Path) -> None:
 
 
 def _conclude(outcome: "Outcome", json_file: Path | None, *, report: bool) -> None:
-    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.names import in_order
+    from teamslam.central.desk.report.run import read_log
     from teamslam.team.recording.parts import join_parts
     from teamslam.team.recording.reader import LogError, open_log
 
@@ -349,21 +349,21 @@ def _conclude(outcome: "Outcome", json_file: Path | None, *, report: bool) -> No
     }
     try:
         log = replace(open_log(outcome.log), reading=steps.share)
-        plain = evaluate(log.samples())
-        evaluation = add_holes(plain, log)
+        reading = read_log(log)
     except (LogError, OSError) as error:
         outcome.failures += [*outcome.deaths, f"the log can not be evaluated: {error}"]
         figures = extra
     else:
+        evaluation = reading.evaluation
         figures = to_json(evaluation, extra)
         print_evaluation(evaluation)
         if report:
-            _write_report(read_run(log, evaluation, steps, proves_ledger=False), outcome, figures)
+            _write_report(read_run(log, reading, steps, proves_ledger=False), outcome, figures)
         if evaluation.map is None:
             outcome.failures.append("the run ended without a final map")
         outcome.failures += evaluation.disagreement
         outcome.failures += evaluation.failures  # with the reasons
-        is_whole = not outcome.failures and len(evaluation.notes) == len(plain.notes)
+        is_whole = not outcome.failures and reading.is_whole
         if outcome.deaths and is_whole:
             text = "; ".join(outcome.deaths)
             click.echo(f"note: {text}; map and log are whole")

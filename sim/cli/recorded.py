@@ -118,10 +118,9 @@ def report(
 
     Exit status 1 if the log is cut: its figures are of the part before the cut.
     """
-    from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.report.page import write_pictures, write_report
-    from teamslam.central.desk.report.run import run_figures
+    from teamslam.central.desk.report.run import read_log, run_figures
     from teamslam.team.recording.reader import open_log
 
     output = output or _folder_of(log)
@@ -130,8 +129,7 @@ def report(
     opened = replace(open_log(log), reading=steps.share)
     opt.check_folder(output)
     steps.begin("scoring the run")
-    evaluation = add_holes(evaluate(opened.samples()), opened)
-    run = read_run(opened, evaluation, steps, proves_ledger=ledger)
+    run = read_run(opened, read_log(opened), steps, proves_ledger=ledger)
     steps.begin("drawing")
     if look or form or picture:
         style = Style(
@@ -145,9 +143,9 @@ def report(
         if picture is not None:
             return
     figures = to_json(
-        evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
+        run.evaluation, {**run_figures(run), "log": str(log), "complete": opened.complete}
     )
-    print_evaluation(evaluation)
+    print_evaluation(run.evaluation)
     print_nis(run.history)
     if (found := run.ledger) is not None:
         verdict = f"{len(found.offenders)} offenders" if found.offenders else found.statement()

@@ -22,7 +22,7 @@ from teamslam.sim.cli.results import (
 )
 
 if TYPE_CHECKING:
-    from teamslam.central.desk.evaluation.results import Evaluation
+    from teamslam.central.desk.report.run import Reading
     from teamslam.central.desk.verification.verification import Verification
     from teamslam.sim.recorded.changed_run import Changes
     from teamslam.team.wire.bus import Sample
@@ -173,7 +173,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     )
     from teamslam.central.desk.evaluation.evaluation import evaluate
     from teamslam.central.desk.evaluation.figures import to_json
-    from teamslam.central.desk.evaluation.history import history
+    from teamslam.central.desk.report.run import read_samples
     from teamslam.central.desk.verification.recorded import RerunError
     from teamslam.sim.cli.importing import readable
     from teamslam.sim.recorded.changed_run import Changes, changed_run, check_days
@@ -185,11 +185,13 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     if isinstance(log, Log):
         opt.warn_of_holes(log)
     check_days(log, changes)
-    recorded = evaluate(log.samples())
+    plain = isinstance(log, DataSetRun) and changes == Changes()
+    original = None if plain else evaluate(log.samples())
     with failing(RerunError, at=path):
-        plain = isinstance(log, DataSetRun) and changes == Changes()
         computed = list(log.samples()) if plain else changed_run(log, changes)
-        changed = recorded if plain else evaluate(computed)
+        reading = read_samples(computed)
+    changed = reading.evaluation
+    recorded = original or changed
     before = "unchanged" if isinstance(log, DataSetRun) else "recorded"
     runs = {"computed": changed} if plain else {before: recorded, "recomputed": changed}
     table = Table("", *runs)
@@ -197,7 +199,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         table.add_row(Text(figure), *map(Text, cells))
     print_table(table)
     print_notes(changed.warnings, dict.fromkeys((*recorded.notes, *changed.notes)))
-    print_nis(history(computed))
+    print_nis(reading.history)
     same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
     moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
     verdict = "the same bytes" if same else f"another one{moved}"
@@ -214,7 +216,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     }
     opt.write_json(json_file, figures)
     if output is not None:
-        _write_run(computed, changed, output)
+        _write_run(computed, reading, output)
         if not plain and draw_maps(runs, output / "maps.png"):
             click.echo(f"wrote {output / 'maps.png'}")
     if changed.map is None:
@@ -225,7 +227,7 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
         opt.fail_if_cut(log, "result")
 
 
-def _write_run(computed: "list[Sample]", evaluation: "Evaluation", folder: Path) -> None:
+def _write_run(computed: "list[Sample]", reading: "Reading", folder: Path) -> None:
     from teamslam.central.desk.evaluation.figures import to_json
     from teamslam.central.desk.report.page import write_report
     from teamslam.central.desk.report.run import run_figures
@@ -233,6 +235,7 @@ def _write_run(computed: "list[Sample]", evaluation: "Evaluation", folder: Path)
     from teamslam.team.recording.reader import IN_FOLDER, open_log
     from teamslam.team.recording.recorder import Recorder
 
+    evaluation = reading.evaluation
     assert evaluation.scenario is not None
     log = folder / IN_FOLDER
     if log.exists():
@@ -240,7 +243,7 @@ def _write_run(computed: "list[Sample]", evaluation: "Evaluation", folder: Path)
     with Recorder(log, evaluation.scenario.team, provenance()) as recorder:
         recorder.write(computed)
     steps = Steps()
-    run = read_run(open_log(log), evaluation, steps, proves_ledger=False)
+    run = read_run(open_log(log), reading, steps, proves_ledger=False)
     steps.begin("drawing")
     print_written(write_report(run, folder, to_json(evaluation, run_figures(run))))
 

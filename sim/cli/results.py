@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from teamslam.central.desk.evaluation.history import History
     from teamslam.central.desk.evaluation.results import Evaluation
-    from teamslam.central.desk.report.run import Run
+    from teamslam.central.desk.report.run import Reading, Run
     from teamslam.team.recording.reader import Log
 
 PATIENCE_S = 3.0  # time [s] between lines and before the first, so short work prints none
@@ -48,28 +48,24 @@ class Steps:
             click.echo(f"{self._what}{words}", err=True)
 
 
-def read_run(log: "Log", evaluation: "Evaluation", steps: Steps, *, proves_ledger: bool) -> "Run":
+def read_run(log: "Log", reading: "Reading", steps: Steps, *, proves_ledger: bool) -> "Run":
     """Contents of a report; proves_ledger: also prove the ledger."""
-    from teamslam.central.desk.evaluation.history import history
     from teamslam.central.desk.export.take_home import take_home
     from teamslam.central.desk.ledger import ledger
     from teamslam.central.desk.report.run import Run
-    from teamslam.central.desk.verification.recorded import RerunError, index_log
+    from teamslam.central.desk.verification.recorded import RerunError
 
-    steps.begin("reading the robots' inputs")
-    messages = index_log(log)
     found, why = None, Run.no_ledger
     if proves_ledger:
         steps.begin("proving the ledger (--no-ledger leaves it out)")
         try:
-            found, why = ledger(messages, steps.robot), ""
+            found, why = ledger(reading.recorded, steps.robot), ""
         except RerunError as error:
             why = str(error)
     steps.begin("smoothing the paths")
-    home = take_home(messages, steps.robot)
-    steps.begin("reading the run's history")
+    home = take_home(reading.recorded, steps.robot)
     command = shlex.join(("teamslam", *sys.argv[1:]))
-    return Run(evaluation, history(log.samples()), log.metadata, found, why, home, command)
+    return Run(reading.evaluation, reading.history, log.metadata, found, why, home, command)
 
 
 def print_table(table: "Table") -> None:

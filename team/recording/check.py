@@ -6,7 +6,7 @@ A publisher counts its publications on a key from 0. A life is the publications 
 import json
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -206,11 +206,30 @@ def check_log(log: Log) -> list[Finding]:
 
 def holes(log: Log) -> list[Finding]:
     """Find missing and duplicate messages, and an unfinished recording."""
-    evidence = _evidence(log)
-    damaged = [] if log.complete else [UNFINISHED]
-    for sample in read_undamaged(log, damaged):
-        evidence.take(sample)
-    return [*(Finding(FILE, what) for what in damaged), *evidence.findings()]
+    found = Holes(log)
+    damaged: list[str] = []
+    for _ in found.through(read_undamaged(log, damaged)):
+        pass
+    return [*(Finding(FILE, what) for what in damaged), *found.findings()]
+
+
+class Holes:
+    """Missing and duplicate messages of a log that another reader reads."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._evidence = _evidence(log)
+
+    def through(self, samples: Iterable[Sample]) -> Iterator[Sample]:
+        """Yield the samples of the log."""
+        for sample in samples:
+            self._evidence.take(sample)
+            yield sample
+
+    def findings(self) -> list[Finding]:
+        """Findings after the last sample, first an unfinished recording."""
+        unfinished = [] if self._log.complete else [Finding(FILE, UNFINISHED)]
+        return [*unfinished, *self._evidence.findings()]
 
 
 @dataclass

@@ -235,7 +235,9 @@ def _name(sample: Sample) -> int:
     return hash((sample.key, sample.counter % 2**32, sample.wall_ns))
 
 
-class _Head(msgspec.Struct, array_like=True, frozen=True, gc=False):
+class Head(msgspec.Struct, array_like=True, frozen=True, gc=False):
+    """First fields of a numbered message."""
+
     tag: str
     stamp_ns: int
     robot: str
@@ -243,10 +245,10 @@ class _Head(msgspec.Struct, array_like=True, frozen=True, gc=False):
     number: Annotated[int, msgspec.Meta(ge=0)]
 
 
-_DECODER = msgspec.msgpack.Decoder(_Head)
+_DECODER = msgspec.msgpack.Decoder(Head)
 
 
-def numbered_in(payload: bytes) -> _Head | None:
+def numbered_in(payload: bytes) -> Head | None:
     """Return the head of a numbered message, or None."""
     try:
         return _DECODER.decode(payload)

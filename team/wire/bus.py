@@ -167,7 +167,12 @@ def try_open(sample: Sample) -> tuple[Channel, str, m.Message] | None:
 def open_printable(sample: Sample) -> tuple[Channel, str, m.Message]:
     """Decode a sample, with printable texts."""
     channel, name, message = opened(sample)
-    return channel, name, make_printable(message) if isinstance(message, _IN_WORDS) else message
+    return channel, name, with_printable_texts(message)
+
+
+def with_printable_texts(message: m.Message) -> m.Message:
+    """Make the texts for people printable."""
+    return make_printable(message) if isinstance(message, _IN_WORDS) else message
 
 
 def open_valid(samples: Iterable[Sample]) -> Iterator[tuple[Channel, str, m.Message]]:

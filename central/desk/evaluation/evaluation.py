@@ -50,7 +50,7 @@ from teamslam.team.config import UNNAMED, RobotConfig
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.former_names import with_current_names
 from teamslam.team.pairs import PAIRS
-from teamslam.team.recording.check import MOST_HOLES, holes
+from teamslam.team.recording.check import MOST_HOLES, Finding
 from teamslam.team.recording.reader import Log
 from teamslam.team.shapes import Bool, Float, Int64
 from teamslam.team.wire import channels as ch
@@ -72,7 +72,11 @@ TeamMotion = tuple[Pose, str]
 
 def evaluate(samples: Iterable[Sample]) -> Evaluation:
     """Evaluate one run from its samples."""
-    log = collect_log(samples)
+    return evaluate_collected(collect_log(samples))
+
+
+def evaluate_collected(log: Collected) -> Evaluation:
+    """Evaluate one run from the collected contents of its log."""
     association = association_result(log)
     robots = {robot: _robot_result(log, robot) for robot in log.robots}
     fused = None
@@ -173,9 +177,8 @@ def _set_aside(faults: Sequence[m.Fault]) -> list[str]:
     ]
 
 
-def add_holes(evaluation: Evaluation, log: Log) -> Evaluation:
+def add_holes(evaluation: Evaluation, log: Log, found: Sequence[Finding]) -> Evaluation:
     """Add notes on the first gaps of the log, and on their number."""
-    found = holes(log)
     lost = [f"the log is not whole, {finding}" for finding in found[:MOST_HOLES]]
     if more := len(found) - len(lost):
         lost.append(
@@ -312,7 +315,7 @@ def _map_result(
     return MapResult(
         rule=message.rule,
         digest=message.digest.hex(),
-        payload_sha256=hashlib.sha256(log.latest[ch.FINAL_MAP.key()].payload).hexdigest(),
+        payload_sha256=hashlib.sha256(log.latest[ch.FINAL_MAP.key()].sample.payload).hexdigest(),
         frame=message.frame,
         ids=ids,
         means=means,
@@ -466,9 +469,10 @@ def _peer_results(log: Collected) -> dict[str, PeerResult]:
         figures = log.figures(node)
         if "set_submaps" not in figures:
             continue
-        sample = log.latest.get(ch.CONCLUDED.key(robot))
+        latest = log.latest.get(ch.CONCLUDED.key(robot))
         concluded = log.newest(ch.CONCLUDED, m.Concluded, robot)
-        at_ns = 0 if sample is None else sample.wall_ns - (log.first_ns or sample.wall_ns)
+        wall_ns = 0 if latest is None else latest.sample.wall_ns
+        at_ns = wall_ns - (log.first_ns or wall_ns)
         found[robot] = PeerResult(
             final_map_sha256=None if concluded is None else concluded.sha256.hex(),
             submaps=int(figures["set_submaps"]) if concluded is None else concluded.submaps,

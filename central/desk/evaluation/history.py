@@ -12,13 +12,13 @@ import numpy as np
 
 from teamslam.central.desk.evaluation.events import MOST, Event, EventDetector
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
+from teamslam.central.desk.logged import Logged, read_logged
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
-from teamslam.team.recording.inventory import numbered_in
 from teamslam.team.shapes import Float, Int64
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, try_open
+from teamslam.team.wire.bus import Sample
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -112,7 +112,9 @@ class _Clocks:
 _Rows = list[tuple[int, float]]  # stamps [ns] and values
 
 
-class _Gathering:
+class HistoryReader:
+    """Gather the history of a run, sample by sample."""
+
     def __init__(self) -> None:
         self.innovations: dict[str, dict[tuple[int, int], m.Innovation]] = defaultdict(dict)
         """By (incarnation, window): a resumed robot repeats some."""
@@ -129,22 +131,24 @@ class _Gathering:
         self.frames = TruthFrames()
         self.measured_ns = self.logged_ns = _NO_SPAN
 
-    def take(self, sample: Sample) -> None:
+    def take(self, each: Logged, as_centre: Logged | None) -> None:
+        """Process a sample, and the same as a centre's."""
+        sample = each.sample
         self.logged_ns = _extend(self.logged_ns, sample.stamp_ns)
-        if (
-            ch.row_of(sample.key) in ch.SENSORS
-            and (head := numbered_in(sample.payload)) is not None
-        ):
-            self.published[head.robot, head.incarnation].take(head.number, sample.wall_ns)
+        if ch.row_of(sample.key) in ch.SENSORS and (numbered := each.numbered) is not None:
+            stream = numbered.robot, numbered.incarnation
+            self.published[stream].take(numbered.number, sample.wall_ns)
             self.measured_ns = _extend(self.measured_ns, sample.stamp_ns)
-        self.take_contents(sample)
+        self._take_contents(each)
+        if as_centre is not None:
+            self._take_contents(as_centre)
 
-    def take_contents(self, sample: Sample) -> None:
-        if ch.row_of(sample.key) not in _CHANNELS:
+    def _take_contents(self, each: Logged) -> None:
+        sample = each.sample
+        # Invalid samples are counted by the evaluation.
+        if ch.row_of(sample.key) not in _CHANNELS or each.opened is None:
             return
-        if (sound := try_open(sample)) is None:  # counted by the evaluation
-            return
-        _, name, message = sound
+        _, name, message = each.opened
         self.events += self.detector.take(message, sample.stamp_ns)
         del self.events[MOST:]
         match message:
@@ -182,27 +186,28 @@ class _Gathering:
                     latency = (wall_ns - first_ns) * 1e-9, (wall_ns - last_ns) * 1e-9
                     self.latencies[member.robot].append(latency)
 
+    def history(self) -> History:
+        """History up to the last sample."""
+        spans = (self.measured_ns, self.logged_ns, (0, 0))
+        span = next(each for each in spans if each != _NO_SPAN)
+        return History(
+            start_ns=span[0],
+            end_ns=span[1],
+            innovations=_by_robot(self.innovations, _innovations),
+            map_nees=_series(self.map_nees),
+            map_cost=_series(self.map_cost),
+            robot_cost=_by_robot(self.robot_cost, _series),
+            latencies=_by_robot(self.latencies, lambda of: Latencies(*np.array(of).T)),
+            events=tuple(sorted(self.events, key=lambda event: event.stamp_ns)),
+        )
+
 
 def history(samples: Iterable[Sample]) -> History:
     """Compute the history of a run."""
-    found = _Gathering()
-    centre = PeersAsCentre()
-    for sample in samples:
-        found.take(sample)
-        if (as_centre := centre.of(sample)) is not None:
-            found.take_contents(as_centre)
-    spans = (found.measured_ns, found.logged_ns, (0, 0))
-    span = next(each for each in spans if each != _NO_SPAN)
-    return History(
-        start_ns=span[0],
-        end_ns=span[1],
-        innovations=_by_robot(found.innovations, _innovations),
-        map_nees=_series(found.map_nees),
-        map_cost=_series(found.map_cost),
-        robot_cost=_by_robot(found.robot_cost, _series),
-        latencies=_by_robot(found.latencies, lambda of: Latencies(*np.array(of).T)),
-        events=tuple(sorted(found.events, key=lambda event: event.stamp_ns)),
-    )
+    found = HistoryReader()
+    for each, as_centre in read_logged(samples, PeersAsCentre()):
+        found.take(each, as_centre)
+    return found.history()
 
 
 def _extend(span_ns: tuple[int, int], stamp_ns: int) -> tuple[int, int]:

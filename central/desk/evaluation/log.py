@@ -1,6 +1,6 @@
 """Collect a log's contents for an evaluation, in one pass.
 
-Measurements, most of a log, are counted by head and added to their stream's `Timed`.
+Measurements, most of a log, are counted and added to their stream's `Timed`.
 """
 
 from collections import defaultdict
@@ -13,22 +13,18 @@ from typing import TypeVar
 from teamslam.central.config import TeamConfig, team_config
 from teamslam.central.desk.evaluation.clocks import Timed
 from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
+from teamslam.central.desk.logged import Logged, read_logged
 from teamslam.central.desk.names import in_order
-from teamslam.central.desk.peers_as_centre import PeersAsCentre, as_centre_final
+from teamslam.central.desk.peers_as_centre import Agreement, PeersAsCentre, as_centre_final
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME
-from teamslam.team.recording.inventory import numbered_in
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, open_printable
+from teamslam.team.wire.bus import Sample, with_printable_texts
 from teamslam.team.wire.channels import Channel, channel_of
-from teamslam.team.wire.codec import WireError, decoded
 
 M = TypeVar("M", bound=m.Message)
-_TIMED: tuple[type[m.AnyOdometry | m.AnyScan], ...] = (
-    m.Odometry, m.Increment, m.Steering, m.Observations, m.Points,
-)  # fmt: skip
-_TIMED_TAGS = frozenset(str(each.__struct_config__.tag) for each in _TIMED)
+_TIMED = (m.Odometry, m.Increment, m.Steering, m.Observations, m.Points)
 _SENSORS = frozenset(ch.SENSORS)
 _NEWEST = frozenset((
     ch.CONCLUDED, ch.WORLD_CONFIG, ch.ROBOT_CONFIG, ch.FINAL_MAP, ch.TRUTH_LANDMARKS, ch.END,
@@ -64,8 +60,8 @@ class Collected:
     measurements: dict[str, dict[tuple[int, int], bool]] = field(
         default_factory=lambda: defaultdict(dict)
     )
-    latest: dict[str, Sample] = field(default_factory=dict)
-    samples: dict[str, list[Sample]] = field(default_factory=lambda: defaultdict(list))
+    latest: dict[str, Logged] = field(default_factory=dict)
+    samples: dict[str, list[Logged]] = field(default_factory=lambda: defaultdict(list))
     timed: dict[tuple[str, int], Timed] = field(default_factory=lambda: defaultdict(Timed))
     unsound: int = 0
     disagreement: tuple[str, ...] = ()
@@ -143,63 +139,60 @@ class Collected:
         found = {} if status is None else status.figures
         return {k.removeprefix(prefix): v for k, v in found.items() if k.startswith(prefix)}
 
-    def sound(self, sample: Sample | None) -> m.Message | None:
-        """Decode a sample; an invalid one counts once."""
-        if sample is None:
+    def sound(self, each: Logged | None) -> m.Message | None:
+        """Message with printable texts; an invalid one counts once."""
+        if each is None:
             return None
-        try:
-            return open_printable(sample)[2]
-        except WireError:
-            self._refuse(sample)
+        if each.message is None:
+            self.unsound += id(each) not in self._refused
+            self._refused.add(id(each))
             return None
+        return with_printable_texts(each.message)
 
-    def _refuse(self, sample: Sample) -> None:
-        self.unsound += id(sample) not in self._refused
-        self._refused.add(id(sample))
-
-    def take(self, sample: Sample) -> None:
-        """Count a sample, and store it if collected."""
+    def take(self, each: Logged, as_centre: Logged | None) -> None:
+        """Count a sample, and store it, and the same as a centre's, if collected."""
+        sample = each.sample
         if self.first_ns is None and sample.wall_ns:
             self.first_ns = sample.wall_ns
         traffic = self.traffic[sample.key]
         traffic.messages += 1
         traffic.bytes += len(sample.payload)
-        self.keep(sample)
-        if (known := channel_of(sample.key)) is not None and known[0] in _SENSORS:
-            self._count(sample, known[1], odometry=known[0] is ch.ODOMETRY)
-
-    def keep(self, sample: Sample) -> None:
-        """Store a message if collected."""
         known = channel_of(sample.key)
-        if known is not None and known[0] in _NEWEST:
-            self.latest[sample.key] = sample
-        elif known is not None and known[0] in _COLLECTED:
-            self.samples[sample.key].append(sample)
+        if known is not None and known[0] in _SENSORS:
+            self._count(each, known[1], odometry=known[0] is ch.ODOMETRY)
+        self._keep(each)
+        if as_centre is not None:
+            self._keep(as_centre)
 
-    def _count(self, sample: Sample, robot: str, *, odometry: bool) -> None:
-        head = numbered_in(sample.payload)
-        if head is None:
-            self._refuse(sample)
+    def _keep(self, each: Logged) -> None:
+        key = each.sample.key
+        channel, _ = channel_of(key) or (None, "")
+        if channel in _NEWEST:
+            self.latest[key] = each
+        elif channel in _COLLECTED:
+            self.samples[key].append(each)
+
+    def _count(self, each: Logged, robot: str, *, odometry: bool) -> None:
+        numbered = each.numbered
+        if numbered is None:
+            self.unsound += 1
             return
-        of_robot, name = self.measurements[robot], (head.incarnation, head.number)
-        if name not in of_robot and head.tag in _TIMED_TAGS:
-            with suppress(WireError):
-                message = decoded(sample.payload, *_TIMED)
-                if message.robot == robot:
-                    self.timed[robot, message.incarnation].take(message)
+        of_robot, name = self.measurements[robot], (numbered.incarnation, numbered.number)
+        if name not in of_robot and isinstance(each.message, _TIMED):
+            self.timed[robot, numbered.incarnation].take(each.message)
         of_robot[name] = odometry or of_robot.get(name, False)
+
+    def conclude(self, agreement: Agreement) -> None:
+        """Take the final map of most peers, in a log without a centre's."""
+        self.disagreement = agreement.disagreement
+        if ch.FINAL_MAP.key() not in self.latest and (largest := agreement.largest) is not None:
+            self._keep(Logged(as_centre_final(largest)))
 
 
 def collect_log(samples: Iterable[Sample]) -> Collected:
     """Collect a log's contents."""
-    found = Collected()
-    centre = PeersAsCentre()
-    for sample in samples:
-        found.take(sample)
-        if (counterpart := centre.of(sample)) is not None:
-            found.keep(counterpart)
-    found.disagreement = centre.agreement.disagreement
-    largest = centre.agreement.largest
-    if ch.FINAL_MAP.key() not in found.latest and largest is not None:
-        found.keep(as_centre_final(largest))
+    found, centre = Collected(), PeersAsCentre()
+    for each, as_centre in read_logged(samples, centre):
+        found.take(each, as_centre)
+    found.conclude(centre.agreement)
     return found

@@ -139,7 +139,7 @@ def _chain(
 def verdicts_given(log: "Collected") -> tuple[str, ...]:
     """Describe the verdicts of a log, in order."""
     keys = [key for key in log.samples if ch.row_of(key) is ch.VERDICT]
-    samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.wall_ns)
+    samples = sorted((s for key in keys for s in log.samples[key]), key=lambda s: s.sample.wall_ns)
     given = [v for v in map(log.sound, samples) if isinstance(v, m.Verdict)]
     rests_on = () if log.final_map is None else log.final_map.verdicts
     return tuple(_words(each, rests_on) for each in given)

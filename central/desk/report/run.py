@@ -1,17 +1,57 @@
 """Contents of a run's report, and its figures for JSON."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from teamslam.central.desk.evaluation.errors import TrajectoryErrors, trajectory_errors
-from teamslam.central.desk.evaluation.history import History
+from teamslam.central.desk.evaluation.evaluation import add_holes, evaluate_collected
+from teamslam.central.desk.evaluation.history import History, HistoryReader
+from teamslam.central.desk.evaluation.log import Collected
 from teamslam.central.desk.evaluation.results import Evaluation
 from teamslam.central.desk.export.take_home import TakenHome
 from teamslam.central.desk.ledger import Ledger
+from teamslam.central.desk.logged import read_logged
 from teamslam.central.desk.paths import SmoothedPath
+from teamslam.central.desk.peers_as_centre import PeersAsCentre
+from teamslam.central.desk.verification.recorded import INPUTS, Recorded
+from teamslam.team.recording.check import Holes
+from teamslam.team.recording.reader import Log
+from teamslam.team.wire.bus import Sample
+from teamslam.team.wire.channels import row_of
+
+
+class Reading(NamedTuple):
+    """Contents of a log that one pass has read; is_whole: without holes."""
+
+    evaluation: Evaluation
+    history: History
+    recorded: Recorded
+    is_whole: bool = True
+
+
+def read_samples(samples: Iterable[Sample]) -> Reading:
+    """Read a run's samples in one pass."""
+    collected, history, recorded = Collected(), HistoryReader(), Recorded()
+    centre = PeersAsCentre()
+    for each, as_centre in read_logged(samples, centre):
+        collected.take(each, as_centre)
+        history.take(each, as_centre)
+        if row_of(each.sample.key) in INPUTS:
+            recorded.take(each)
+    collected.conclude(centre.agreement)
+    return Reading(evaluate_collected(collected), history.history(), recorded)
+
+
+def read_log(log: Log) -> Reading:
+    """Read a log in one pass; its holes are notes of the evaluation. Raises LogError."""
+    holes = Holes(log)
+    reading = read_samples(holes.through(log.samples()))
+    found = holes.findings()
+    evaluation = add_holes(reading.evaluation, log, found)
+    return reading._replace(evaluation=evaluation, is_whole=not found)
 
 
 @dataclass(frozen=True)

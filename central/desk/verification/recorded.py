@@ -1,7 +1,7 @@
 """Index a log by recorded inputs and recomputable outputs."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
@@ -10,16 +10,16 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from teamslam.central.config import UNREADABLE, CentralConfig
+from teamslam.central.desk.logged import Logged
 from teamslam.central.desk.names import in_order
 from teamslam.team.config import RobotConfig
 from teamslam.team.estimation.hybrid_slam.window_path import WindowPath
 from teamslam.team.former_names import with_current_names
-from teamslam.team.recording.reader import Log, LogError
+from teamslam.team.recording.reader import Log
 from teamslam.team.store import Stream
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
-from teamslam.team.wire.bus import Sample, opened
-from teamslam.team.wire.codec import WireError
+from teamslam.team.wire.bus import Sample
 
 M = TypeVar("M", bound=m.Message)
 T = TypeVar("T")
@@ -119,18 +119,17 @@ class Recorded:
         self.alone: dict[Stream, RunAlone] = {}
         self.unsound = 0
 
-    def take_all(self, samples: Sequence[Sample]) -> None:
+    def take_all(self, samples: Iterable[Sample]) -> None:
         """Index samples in log order."""
         for sample in samples:
-            self.take(sample)
+            self.take(Logged(sample))
 
-    def take(self, sample: Sample) -> None:
+    def take(self, each: Logged) -> None:
         """Index one sample; a viewer's samples are ignored."""
-        try:
-            channel, _, message = opened(sample)
-        except WireError:
-            self.unsound += ch.VIEW.owner(sample.key) is None
+        if each.opened is None:
+            self.unsound += ch.VIEW.owner(each.sample.key) is None
             return
+        channel, _, message = each.opened
         if m.is_measurement(message):  # most messages are measurements
             self.measurements[message.robot, message.incarnation].put(message)
             return
@@ -155,7 +154,7 @@ class Recorded:
                     (s.robot, s.incarnation): s.measurements for s in message.streams
                 }
             case _ if channel.recomputable:
-                self.outputs[channel.name].append(RecordedOutput(sample, message))
+                self.outputs[channel.name].append(RecordedOutput(each.sample, message))
 
     def of(self, kind: type[M], *channels: ch.Channel) -> list[M]:
         """Recorded messages of a kind by channel, in log order."""
@@ -227,10 +226,7 @@ INPUTS = tuple(c for c in ch.CHANNELS if c.recomputable or c in (*ch.SENSORS, *_
 def index_log(log: Log) -> Recorded:
     """Index a log in one pass."""
     found = Recorded()
-    for chunk in log.chunks(INPUTS):
-        if isinstance(chunk, LogError):
-            raise chunk
-        found.take_all(chunk)
+    found.take_all(log.samples(INPUTS))
     return found
 
 

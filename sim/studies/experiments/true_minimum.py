@@ -297,8 +297,7 @@ def final_fold(
 ) -> Fold:
     """Recompute the final fold, by default with plain squares."""
     log = Recorded()
-    for sample in samples:
-        log.take(sample)
+    log.take_all(samples)
     ticks = TickFold(log.central_config()[0], limits=None)
     sightings = log.sightings()
     for stream, measurements in log.measurements.items():

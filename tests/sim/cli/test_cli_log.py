@@ -7,7 +7,7 @@ from teamslam.sim.cli.commands import WRONG_USE
 from teamslam.sim.cli.main import app
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.utias import write_utias
-from teamslam.team.recording.check import NO_FINAL
+from teamslam.team.recording.check import NO_FINAL, holes
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.wire.bus import Sample, opened
@@ -195,7 +195,7 @@ def test_a_run_with_many_gaps_has_five_notes_and_their_number(tmp_path):
         recorder.write([*published(), *views])
     log = open_log(path)
     plain = evaluate(log.samples())
-    notes = add_holes(plain, log).notes[len(plain.notes) :]
+    notes = add_holes(plain, log, holes(log)).notes[len(plain.notes) :]
     assert len(notes) == 6
     assert (
         notes[-1] == f"the log is not whole, 3 more findings: `teamslam log check {path}` names all"
