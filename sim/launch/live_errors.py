@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field
 
 from teamslam.central.desk.evaluation.running import (
+    DisplayedPoses,
+    Estimate,
     NeesTally,
     RunningErrors,
-    TrueLandmarks,
-    TruthFrames,
+    TeamTruth,
 )
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
@@ -16,15 +17,10 @@ EVERY_NS = 1_000_000_000  # least team time between a robot's compared poses
 
 
 @dataclass
-class _Robot:
-    tally: NeesTally = field(default_factory=NeesTally)
+class _Robot(DisplayedPoses):
     errors: RunningErrors = field(default_factory=lambda: RunningErrors(EVERY_NS))
-    given_map: bool = False
+    tally: NeesTally = field(default_factory=NeesTally)
     team_ns: int = -1
-
-    def begin_again(self, *, given_map: bool) -> None:
-        self.given_map, self.tally = given_map, NeesTally()
-        self.errors.forget_poses()
 
     def judge(self) -> None:
         if (found := self.errors.known()) is not None:
@@ -41,8 +37,7 @@ class LiveErrors:
 
     landmarks: NeesTally = field(default_factory=NeesTally)
     _robots: dict[str, _Robot] = field(default_factory=dict)
-    _truth: TrueLandmarks = field(default_factory=TrueLandmarks)
-    _frames: TruthFrames = field(default_factory=TruthFrames)
+    _truth: TeamTruth = field(default_factory=TeamTruth)
 
     def of(self, robot: str) -> NeesTally:
         """Errors of online poses, given the team's map if there are any."""
@@ -58,39 +53,35 @@ class LiveErrors:
             known.team_ns = sample.stamp_ns
             if is_again:
                 return True
-        if known.given_map != (channel is ch.TEAM_POSE):
+        if known.by_team != (channel is ch.TEAM_POSE):
             return channel is ch.TEAM_POSE  # the first one given the map replaces the others
         return known.errors.is_due(sample.stamp_ns)
 
     def take(self, channel: ch.Channel, message: m.Message) -> None:
         """Process a message of any channel."""
+        self._truth.take(message)
         match message:
-            case m.InitialPose():
-                self._frames.take(message)
             case m.PoseEstimate():
                 self._take_pose(message, by_team=channel is ch.TEAM_POSE)
             case m.Truth():
                 robot = self._robot(message.robot)
                 robot.errors.take_truth(message)
                 robot.judge()
-            case m.TruthLandmarks():
-                self._truth = TrueLandmarks.of(message)
             case m.FusedMap():
-                self._take_map(message)
+                self.landmarks = NeesTally()
+                if (fit := self._truth.fit(message)) is not None:
+                    self.landmarks.take(fit.nees, 2)
 
     def _robot(self, name: str) -> _Robot:
         return self._robots.setdefault(name, _Robot())
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         robot = self._robot(message.robot)
-        given_map = by_team and message.in_team_frame
-        if by_team and given_map != robot.given_map:
-            robot.begin_again(given_map=given_map)
-        if by_team == given_map and self._frames.has(message.frame):
-            robot.errors.take_pose(message)
+        before = robot.by_team
+        is_displayed = robot.has(message, by_team=by_team)
+        if robot.by_team is not before:
+            robot.tally = NeesTally()
+            robot.errors.forget_poses()
+        if is_displayed and self._truth.frames.has(message.frame):
+            robot.errors.take_pose(Estimate.of(message))
         robot.judge()
-
-    def _take_map(self, fused: m.FusedMap) -> None:
-        self.landmarks = NeesTally()
-        if self._frames.has(fused.frame) and (fit := self._truth.fit(fused)) is not None:
-            self.landmarks.take(fit.nees, 2)

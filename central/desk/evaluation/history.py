@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from teamslam.central.desk.evaluation.events import MOST, Event, EventDetector
-from teamslam.central.desk.evaluation.running import TrueLandmarks, TruthFrames
+from teamslam.central.desk.evaluation.running import TeamTruth
 from teamslam.central.desk.logged import Logged, read_logged
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
@@ -127,8 +127,7 @@ class HistoryReader:
         self.unused: dict[tuple[str, int], dict[int, tuple[int, int]]] = defaultdict(dict)
         """First and last measurement of submaps that no map has used, by stream and sequence."""
         self.latencies: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        self.truth = TrueLandmarks()
-        self.frames = TruthFrames()
+        self.truth = TeamTruth()
         self.measured_ns = self.logged_ns = _NO_SPAN
 
     def take(self, each: Logged, as_centre: Logged | None) -> None:
@@ -149,6 +148,7 @@ class HistoryReader:
         if ch.row_of(sample.key) not in _CHANNELS or each.opened is None:
             return
         _, name, message = each.opened
+        self.truth.take(message)
         self.events += self.detector.take(message, sample.stamp_ns)
         del self.events[MOST:]
         match message:
@@ -160,10 +160,6 @@ class HistoryReader:
             case m.Innovation():
                 window = message.incarnation, message.sequence
                 self.innovations[message.robot][window] = message
-            case m.InitialPose():
-                self.frames.take(message)
-            case m.TruthLandmarks():
-                self.truth = TrueLandmarks.of(message)
             case m.Status() if name == "central":
                 for figure, value in message.figures.items():
                     if figure.startswith(_COST):
@@ -173,7 +169,7 @@ class HistoryReader:
     def _take_map(self, fused: m.FusedMap, wall_ns: int) -> None:
         if fused.dof > 0:
             self.map_cost.append((fused.stamp_ns, fused.chi2 / fused.dof))
-        if self.frames.has(fused.frame) and (fit := self.truth.fit(fused)) is not None:
+        if (fit := self.truth.fit(fused)) is not None:
             of_blocks, of_map = float(fit.nees.mean()) / 2.0, fit.nees_per_dof
             self.map_nees.append((fused.stamp_ns, of_blocks if of_map is None else of_map))
         for member in fused.members:

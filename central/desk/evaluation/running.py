@@ -128,6 +128,22 @@ class NeesTally:
         return self.inside / self.count if self.count else None
 
 
+class Estimate(NamedTuple):
+    """Pose (x [m], y [m], theta [rad]) with its covariance, in a frame."""
+
+    stamp_ns: int
+    frame: str
+    pose: Pose
+    covariance: Float[np.ndarray, "3 3"]
+
+    @classmethod
+    def of(cls, message: m.PoseEstimate) -> "Estimate":
+        """Convert a robot's message."""
+        pose = floats(message.pose, "pose").astype(np.float64)
+        P = floats(message.covariance, "covariance").astype(np.float64).reshape(3, 3)
+        return cls(message.stamp_ns, message.frame, pose, P)
+
+
 @dataclass
 class RunningErrors:
     """Errors of one robot's running poses; truth and poses in either order.
@@ -137,9 +153,7 @@ class RunningErrors:
 
     spacing_ns: int = SPACING_NS
     last_ns: int | None = None
-    _poses: deque[tuple[int, Pose, Float[np.ndarray, "3 3"]]] = field(
-        default_factory=lambda: deque(maxlen=WAITING)
-    )
+    _poses: deque[Estimate] = field(default_factory=lambda: deque(maxlen=WAITING))
     _truth: deque[Path] = field(default_factory=lambda: deque(maxlen=BATCHES))
 
     def take_truth(self, message: m.Truth) -> None:
@@ -152,24 +166,21 @@ class RunningErrors:
         """Whether a pose is far enough from the last."""
         return self.last_ns is None or stamp_ns >= self.last_ns + self.spacing_ns
 
-    def take_pose(self, message: m.PoseEstimate) -> None:
+    def take_pose(self, estimate: Estimate) -> None:
         """Add an estimate, unless too near to the last."""
-        if not self.is_due(message.stamp_ns):
-            return
-        self.last_ns = message.stamp_ns
-        pose = floats(message.pose, "pose").astype(np.float64)
-        P = floats(message.covariance, "covariance").astype(np.float64).reshape(3, 3)
-        self._poses.append((message.stamp_ns, pose, P))
+        if self.is_due(estimate.stamp_ns):
+            self.last_ns = estimate.stamp_ns
+            self._poses.append(estimate)
 
     def known(self) -> PoseErrors | None:
         """Errors of poses whose truth has arrived since the last call."""
         until = int(self._truth[-1].stamps_ns[-1]) if self._truth else -(2**63)
         due = []
-        while self._poses and self._poses[0][0] <= until:
+        while self._poses and self._poses[0].stamp_ns <= until:
             due.append(self._poses.popleft())
         if not due:
             return None
-        times, poses, covariances = zip(*due, strict=True)
+        times, _, poses, covariances = zip(*due, strict=True)
         path = Path(np.array(times, dtype=np.int64), np.array(poses))
         return pose_errors(path, np.array(covariances), self._path(times[-1]))
 
@@ -182,7 +193,7 @@ class RunningErrors:
         """Discard older poses, and truth but the last batch before."""
         while len(self._truth) > 1 and int(self._truth[1].stamps_ns[0]) < before_ns:
             self._truth.popleft()
-        while self._poses and self._poses[0][0] < before_ns:
+        while self._poses and self._poses[0].stamp_ns < before_ns:
             self._poses.popleft()
 
     def forget_poses(self) -> None:
@@ -197,25 +208,56 @@ class RunningErrors:
 
 
 @dataclass
-class TruthAlignment:
+class DisplayedPoses:
+    """Choice of one robot's poses: those given the team's map if there are any, else its own."""
+
+    errors: RunningErrors = field(default_factory=RunningErrors)
+    by_team: bool = False
+
+    def has(self, message: m.PoseEstimate, *, by_team: bool) -> bool:
+        """Whether a pose is displayed; one outside the team's frame ends those given its map."""
+        if by_team:
+            if self.by_team and not message.in_team_frame:
+                self.errors.forget_poses()  # their frame is no longer the team's
+            self.by_team = message.in_team_frame
+        return by_team is self.by_team
+
+
+@dataclass
+class TeamTruth:
+    """True landmarks of a team, and the frames that have truth."""
+
+    landmarks: TrueLandmarks = field(default_factory=TrueLandmarks)
+    frames: TruthFrames = field(default_factory=TruthFrames)
+
+    def take(self, message: m.Message) -> None:
+        """Store initial poses and true landmarks."""
+        match message:
+            case m.InitialPose():
+                self.frames.take(message)
+            case m.TruthLandmarks():
+                self.landmarks = TrueLandmarks.of(message)
+
+    def fit(self, fused: m.FusedMap) -> MapFit | None:
+        """Errors of a map's landmarks; None without truth in its frame."""
+        return self.landmarks.fit(fused) if self.frames.has(fused.frame) else None
+
+
+@dataclass
+class TruthAlignment(TeamTruth):
     """Truth of a team, and map_from_truth of its maps, as `evaluate` aligns the final map.
 
     In a frame that no known initial pose or survey fixes, the true landmarks are aligned with those
     of the map, or else the true with the smoothed paths.
     """
 
-    landmarks: TrueLandmarks = field(default_factory=TrueLandmarks)
-    frames: TruthFrames = field(default_factory=TruthFrames)
     _truth: dict[str, list[Path]] = field(default_factory=dict)
     _smoothed: dict[tuple[str, int, int], Path] = field(default_factory=dict)
 
     def take(self, message: m.Message) -> None:
         """Store initial poses, truth and smoothed paths."""
+        super().take(message)
         match message:
-            case m.InitialPose():
-                self.frames.take(message)
-            case m.TruthLandmarks():
-                self.landmarks = TrueLandmarks.of(message)
             case m.Truth():
                 stamps, poses = translate.trajectory_of(message)
                 kept = np.unique(stamps // SPACING_NS, return_index=True)[1]

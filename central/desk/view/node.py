@@ -12,7 +12,12 @@ import numpy as np
 from teamslam.central.desk.drawing import colour_of
 from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.events import Event, EventDetector
-from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment, TruthFrames
+from teamslam.central.desk.evaluation.running import (
+    DisplayedPoses,
+    Estimate,
+    TruthAlignment,
+    TruthFrames,
+)
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.view import foxglove_scene as fox
 from teamslam.central.desk.view.drawn import Landmarks, Track, centre_particles, landmarks_of
@@ -43,17 +48,15 @@ class Shown(NamedTuple):
 
 
 @dataclass
-class _Robot:
-    """One robot; its team pose is preferred to its own.
+class _Robot(DisplayedPoses):
+    """One robot.
 
     coming: estimates after the view's time. at_ends: the smoothed poses are at the ends of submaps.
     """
 
     coming: deque[m.PoseEstimate] = field(default_factory=deque)
-    by_team: bool = False
     reached_ns: int | None = None
-    estimate: m.PoseEstimate | None = None
-    errors: RunningErrors = field(default_factory=RunningErrors)
+    estimate: Estimate | None = None
     last_error: tuple[Pose, float] | None = None
     track: Track = field(default_factory=Track)
     true_track: Track = field(default_factory=Track)
@@ -63,14 +66,6 @@ class _Robot:
     lost: bool = False
     done: bool = False
     status: dict[str, float] = field(default_factory=dict)
-
-    def pose(self) -> Pose:
-        assert self.estimate is not None
-        return floats(self.estimate.pose, "pose").astype(np.float64)
-
-    def covariance(self) -> Float[np.ndarray, "3 3"]:
-        assert self.estimate is not None
-        return floats(self.estimate.covariance, "covariance").astype(np.float64).reshape(3, 3)
 
     def reach(self, stamp_ns: int) -> None:
         self.reached_ns = stamp_ns if self.reached_ns is None else max(self.reached_ns, stamp_ns)
@@ -83,8 +78,8 @@ class _Robot:
 
     def go_to(self, now_ns: int, frames: TruthFrames) -> None:
         while self.coming and self.coming[0].stamp_ns <= now_ns:
-            self.estimate = self.coming.popleft()
-            x, y, _ = self.pose().tolist()
+            self.estimate = Estimate.of(self.coming.popleft())
+            x, y, _ = self.estimate.pose.tolist()
             self.track.take(self.estimate.stamp_ns, x, y)
             if frames.has(self.estimate.frame):
                 self.errors.take_pose(self.estimate)
@@ -188,13 +183,13 @@ class ViewerNode:
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         robot = self._of(message.robot)
+        before = robot.by_team
+        is_displayed = robot.has(message, by_team=by_team)
         if by_team and not message.in_team_frame:
-            robot.by_team = False
             robot.leave()
-        elif by_team and not robot.by_team:
-            robot.by_team = True
+        elif robot.by_team and not before:
             robot.coming = deque(p for p in robot.coming if p.stamp_ns < message.stamp_ns)
-        if by_team is robot.by_team:
+        if is_displayed:
             if message.in_team_frame or not self._has_map:
                 robot.coming.append(message)
             elif robot.estimate is not None or robot.coming:
@@ -231,19 +226,19 @@ class ViewerNode:
     def _payloads(self, now_ns: int, *, last: bool) -> Iterator[tuple[str, bytes]]:
         size = self._size_m()
         motion = self._truth.map_from_truth(self._fused)
-        seen = {n: r for n, r in self._in_order() if r.estimate is not None}
+        seen = [(n, r, r.estimate) for n, r in self._in_order() if r.estimate is not None]
         if self._map_is_new:
             self._map_is_new = False
             yield from self._map_payloads(now_ns, size, motion)
         yield views.ROBOTS.key(), self._scene(now_ns, size, motion)
-        poses = [(name, robot.pose()) for name, robot in seen.items()]
+        poses = [(name, estimate.pose) for name, _, estimate in seen]
         yield views.TRANSFORMS.key(), fox.transforms(now_ns, poses)
-        for name, robot in seen.items():
-            yield views.POSE.key(name), fox.pose_in_map(now_ns, robot.pose())
-            yield views.ROBOT.key(name), msgspec.json.encode(_figures(robot, now_ns))
-        for name, robot in seen.items():
+        for name, robot, estimate in seen:
+            yield views.POSE.key(name), fox.pose_in_map(now_ns, estimate.pose)
+            yield views.ROBOT.key(name), msgspec.json.encode(_figures(robot, estimate, now_ns))
+        for name, robot, estimate in seen:
             if robot.cloud is not None:
-                points = transform_points(robot.pose(), centre_particles(robot.cloud))
+                points = transform_points(estimate.pose, centre_particles(robot.cloud))
                 weights = floats(robot.cloud.weights, "weights").astype(np.float64)
                 yield views.PARTICLES.key(name), fox.cloud(now_ns, points, weights, "weight")
                 robot.cloud = None
@@ -261,7 +256,7 @@ class ViewerNode:
         for robot in self._robots.values():
             robot.go_to(now_ns, self._truth.frames)
             if robot.estimate is not None:
-                self._extend(robot.pose()[np.newaxis, :2])
+                self._extend(robot.estimate.pose[np.newaxis, :2])
 
     def _map_payloads(
         self, now_ns: int, size_m: float, motion: Motion
@@ -288,7 +283,7 @@ class ViewerNode:
                 trail = robot.track.since(now_ns - TRAIL_NS)
                 entities.append(
                     fox.robot_entity(
-                        now_ns, name, robot.pose(), robot.covariance(), trail,
+                        now_ns, name, robot.estimate.pose, robot.estimate.covariance, trail,
                         colour_of(number), size_m, lost=robot.lost,
                     )
                 )  # fmt: skip
@@ -316,9 +311,7 @@ class ViewerNode:
         return fox.scene(entities)
 
     def _team(self, now_ns: int) -> views.TeamFigures:
-        fused = self._fused
-        known = fused is not None and self._truth.frames.has(fused.frame)
-        fit = None if fused is None or not known else self._truth.landmarks.fit(fused)
+        fit = None if self._fused is None else self._truth.fit(self._fused)
         return views.TeamFigures(
             now_ns * 1e-9,
             0 if self._landmarks is None else len(self._landmarks.ids),
@@ -335,9 +328,9 @@ def _log_line(event: Event) -> Shown:
     return Shown(views.LOG.key(), event.stamp_ns, line)
 
 
-def _figures(robot: _Robot, now_ns: int) -> views.RobotFigures:
-    x, y, heading = robot.pose().tolist()
-    to_x, to_y, to_heading = (3.0 * np.sqrt(np.diagonal(robot.covariance()))).tolist()
+def _figures(robot: _Robot, estimate: Estimate, now_ns: int) -> views.RobotFigures:
+    x, y, heading = estimate.pose.tolist()
+    to_x, to_y, to_heading = (3.0 * np.sqrt(np.diagonal(estimate.covariance))).tolist()
     figures = views.RobotFigures(
         now_ns * 1e-9, x, y, heading, to_x, to_y, to_heading, status=robot.status
     )

@@ -26,7 +26,7 @@ from teamslam.central.desk.drawing import ROBOT_COLOURS
 from teamslam.central.desk.evaluation.association import members_of
 from teamslam.central.desk.evaluation.errors import transform_points
 from teamslam.central.desk.evaluation.events import EventDetector, is_awaited
-from teamslam.central.desk.evaluation.running import RunningErrors, TruthAlignment
+from teamslam.central.desk.evaluation.running import DisplayedPoses, Estimate, TruthAlignment
 from teamslam.central.desk.names import data_set_of
 from teamslam.central.desk.view.drawn import Landmarks, centre_particles, landmarks_of
 from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
@@ -74,9 +74,7 @@ class _Robot(msgspec.Struct, frozen=True):
 
 
 @dataclass
-class _Stream:
-    errors: RunningErrors = field(default_factory=RunningErrors)
-    by_team: bool = False
+class _Stream(DisplayedPoses):
     outside: bool = False
     frame: str | None = None
     pose_ns: int | None = None
@@ -204,12 +202,9 @@ class PageFrames:
 
     def _take_pose(self, message: m.PoseEstimate, *, by_team: bool) -> None:
         stream = self._streams[message.robot]
-        if by_team and stream.by_team and not message.in_team_frame:
-            stream.errors.forget_poses()  # their frame is no longer the team's
-        if by_team:
-            stream.by_team = message.in_team_frame
+        is_displayed = stream.has(message, by_team=by_team)
         due = stream.pose_ns is None or message.stamp_ns >= stream.pose_ns + SPACING_NS
-        if by_team is not stream.by_team or not due:
+        if not (is_displayed and due):
             return
         stream.pose_ns = message.stamp_ns
         outside = self._has_map and not message.in_team_frame
@@ -222,13 +217,12 @@ class PageFrames:
         if stream.frame not in (None, frame):
             self._add_frame("frame", r=message.robot, t=self._t(message.stamp_ns))
         stream.frame = frame
-        x, y, heading = floats(message.pose, "pose").tolist()
-        P = floats(message.covariance, "covariance").reshape(3, 3)
-        spread = [float(P[0, 0]), float(P[0, 1]), float(P[1, 1]), float(P[2, 2])]
-        row = [_short(v) for v in (x, y, heading, *spread)]
+        estimate = Estimate.of(message)
+        spread = estimate.covariance[(0, 0, 1, 2), (0, 1, 1, 2)].tolist()
+        row = [_short(v) for v in (*estimate.pose.tolist(), *spread)]
         stream.add("pose", self._t(message.stamp_ns), row)
-        if self._truth.frames.has(message.frame):
-            stream.errors.take_pose(message)
+        if not frame:
+            stream.errors.take_pose(estimate)
 
     def _take_truth(self, message: m.Truth) -> None:
         stream = self._streams[message.robot]
@@ -290,8 +284,7 @@ class PageFrames:
         self._has_map = len(landmarks.ids) > 0
         self._map = message if self._has_map else None
         self._align()
-        is_true = self._truth.frames.has(message.frame)
-        fit = self._truth.landmarks.fit(message) if is_true else None
+        fit = self._truth.fit(message)
         extra: dict[str, object] = {}
         if sets := sets_of(message):
             support = [sets.get(int(id_), (0, [])) for id_ in landmarks.ids]

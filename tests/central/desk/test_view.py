@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from teamslam.central.desk.evaluation.errors import transform_points
-from teamslam.central.desk.evaluation.running import RunningErrors
+from teamslam.central.desk.evaluation.running import Estimate, RunningErrors
 from teamslam.central.desk.view.drawn import centre_particles
 from teamslam.central.desk.view.export import export_views, run_viewer, with_views
 from teamslam.central.desk.view.node import LAG_NS, PERIOD_NS, ViewerNode
@@ -152,7 +152,7 @@ def test_an_error_is_known_as_soon_as_pose_and_truth_are_there(truth_first):
     errors = RunningErrors()
     steps = [
         lambda: errors.take_truth(truth([0.0, 1.0, 2.0])),
-        lambda: errors.take_pose(pose(1.5, 2)),
+        lambda: errors.take_pose(Estimate.of(pose(1.5, 2))),
     ]
     for step in steps if truth_first else steps[::-1]:
         assert errors.known() is None
