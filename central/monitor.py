@@ -19,8 +19,8 @@ from teamslam.team.estimation.map_joining.marginals import Agreement, BiasEstima
 SCALE_WARN = math.sqrt(2.0)  # bound of the team's covariance scale; its inverse is the lower one
 ROBOT_WARN = 1.5  # bound of a robot's: one of five sound robots of real data sets reaches 1.4
 MISCALIBRATED = 0.015  # bound of the mean of the robots' scale biases
-SIGMAS = 3.0
-SCALE_SIGMAS = 3.3
+SIGMAS = 3.0  # of the mean scale bias beyond which the models are wrong
+SCALE_SIGMAS = 3.3  # of a scale's logarithm out of bounds: by chance less than once in a thousand
 
 
 class Misscale(NamedTuple):

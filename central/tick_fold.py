@@ -50,7 +50,8 @@ GROWTH = 1.25  # growth of the set after which suspects are tested again
 LATE_CUTS = 3  # most seams that the final map cuts beside those of running maps
 FULL_UNNAMED = 1000
 """Most submaps without landmark names for which the full solution folds all ticks again, since the
-ticks decide which observations are one landmark: more would take hours.
+ticks decide which observations are one landmark. With more, which would take hours, the full
+solution starts from the running fold.
 """
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from teamslam.team import translate
 from teamslam.team.config import Bounds
-from teamslam.team.estimation.gaussian import PoseGaussian, curved
+from teamslam.team.estimation.gaussian import UNSOLVABLE, PoseGaussian, curved
 from teamslam.team.estimation.map_joining.conditioning import join_pending
 from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.robot.maps import CONDENSED, TeamMap
@@ -75,6 +75,21 @@ def test_a_robot_that_has_come_back_does_not_count_what_the_prior_has_already():
         assert kept.join(told, LOCALS[:known]).whole.mean.tobytes() == alone.mean.tobytes()
     expected = join_pending(alone, LOCALS[5:]).whole
     assert kept.join(told, LOCALS).whole.mean.tobytes() == expected.mean.tobytes()
+
+
+def test_that_a_prior_has_no_solution_is_found_once_and_raised_at_every_pose(monkeypatch):
+    tried: list[int] = []
+
+    def unsolvable(whole, pending):
+        tried.append(1)
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("teamslam.team.robot.maps.join_pending", unsolvable)
+    kept, told = TeamMap(), prior(1)
+    for each, tries in ((told, 1), (told, 1), (prior(2), 2)):
+        with pytest.raises(UNSOLVABLE):
+            kept.pose(each, LOCALS, None)
+        assert len(tried) == tries
 
 
 @pytest.mark.parametrize(

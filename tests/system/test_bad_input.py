@@ -1,6 +1,6 @@
 """Wrong input that a process detects: one clear message, exit status 2, no process left.
 
-For single commands see `tests/sim/cli/test_wrong_use.py`.
+For single commands see `tests/sim/cli/test_help.py`.
 """
 
 import asyncio

@@ -35,13 +35,6 @@ at 0.9, since some are often hidden.
 """
 HIDDEN = 0.1
 """Probability that a landmark in view is hidden up to some time of the window, or from it on."""
-LEAST = 0.1  # least probability that a detected landmark is in view
-WIDER, FARTHER = 0.5, 1.25
-"""Margin [rad] of the sector in view beyond the outermost bearing, and its least range in multiples
-of the median, for robots that stand still.
-"""
-STEPS = 30  # most steps of belief propagation
-SETTLED = 1e-6  # change of the messages below which belief propagation ends
 
 
 @dataclass(frozen=True)
@@ -275,6 +268,13 @@ def _log_beta(
     return np.asarray(found)
 
 
+LEAST = 0.1  # least probability that a detected landmark is in view
+WIDER, FARTHER = 0.5, 1.25
+"""Margin [rad] of the sector in view beyond the outermost bearing, and its least range in multiples
+of the median, for robots that stand still.
+"""
+
+
 @dataclass(frozen=True)
 class FieldOfView:
     """Sector that a window's scans observe, estimated from its detections.
@@ -364,6 +364,10 @@ def association_probabilities(
         chosen = landmark_of[of_scan]
         certain[of_scan] = marginals(weights)[np.arange(len(chosen)), chosen]
     return certain
+
+
+STEPS = 30  # most steps of belief propagation
+SETTLED = 1e-6  # change of the messages below which belief propagation ends
 
 
 def marginals(weights: Float[np.ndarray, "n L"]) -> Float[np.ndarray, "n L"]:

@@ -89,7 +89,8 @@ def find_missed(fold: Fold, ids: Collection[int]) -> list[int]:
     judged by an operator.
 
     A landmark of n < MOST submaps is missed if each landmark of MOST or more submaps beside it was
-    observed by MOST n, and at least half of its submaps have one beside it.
+    observed by MOST n, and at least half of its submaps have one beside it. Saved maps
+    do not count.
     """
     graph = fold.main.graph
     counts = np.zeros(len(graph.fixed), np.int64)

@@ -90,13 +90,13 @@ class JoinSettings:
 
     robust: factors beyond their gates are discounted. The gates of χ² are wider by robust_start² at
     first, and by robust_decay² less with each iteration, down to 1. submap_gate: factor on a
-    submap's gate. landmark_gate: χ² from which a submap's landmark is discounted. max_iterations,
-    step_tolerance: end of a full solve, by number or largest change [m, rad]. alignment_confidence,
-    alignment_heading_sigma: for a merge, quantile of the χ² test and largest
+    submap's gate. landmark_gate: χ² of two numbers from which a submap's landmark is discounted.
+    max_iterations, step_tolerance: end of a full solve, by number or largest change [m, rad].
+    alignment_confidence, alignment_heading_sigma: for a merge, quantile of the χ² test and largest
     `Alignment.heading_sigma` [rad]. bias_sigma: scale of Student's t prior on each error of a
-    robot's submaps; common_bias_sigma: of those that all robots share. joined_ranges: see
-    `core.SubmapFactor.at_joined_ranges`. landmark_sigma: deviation [m] of the measured point about
-    the landmark's place, added to a map's covariance.
+    robot's submaps. common_bias_sigma: standard deviation of those that all robots share; "marker":
+    share of the range. joined_ranges: see `core.SubmapFactor.at_joined_ranges`. landmark_sigma:
+    deviation [m] of the measured point about the landmark's place, added to a map's covariance.
     """
 
     iterations_per_tick: int = 2
@@ -335,6 +335,7 @@ def solve_island(island: Island) -> tuple[Island, int, float]:
     """Solve in full; return also the number of iterations and the last change [m, rad].
 
     Least squares comes first: it is the robust solution where no factor is beyond its gate.
+    Otherwise the gates narrow anew.
     """
     if island.settings.robust:
         with suppress(*UNSOLVABLE):

@@ -90,7 +90,8 @@ class SightingCost(NamedTuple):
 
 class Agreement(NamedTuple):
     """Joint cost Σ w χ² and its degrees of freedom, in total, per robot (an inter-robot measurement
-    counts for its observer) and per submap; the inter-robot measurements, oldest first.
+    counts for its observer) and per submap; unweighted χ² of the inter-robot measurements, oldest
+    first. A discounted landmark counts by its weight.
     """
 
     chi2: float

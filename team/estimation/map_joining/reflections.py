@@ -58,14 +58,13 @@ def find_reflections(fold: Fold, robots: Iterable[str]) -> Iterator[Reflection]:
 
 
 def _landmarks(island: Island, robot: str, *, is_own: bool) -> Float[np.ndarray, "n 2"]:
-    """Positions of the landmarks that LEAST_SUBMAPS submaps of a robot, or of others, observe."""
+    """List the positions of landmarks that LEAST_SUBMAPS submaps of a robot, or others, observe."""
     counts = np.zeros(len(island.graph.fixed), np.int64)
     for each in island.graph.submaps:
         of = each.contribution
         if (of.robot == robot) is is_own and not is_map(of.stream):
             counts[each.landmarks[each.landmarks >= 0]] += 1
-    at = island.graph.offset[np.flatnonzero(counts >= LEAST_SUBMAPS)]
-    return np.column_stack([island.state[at], island.state[at + 1]])
+    return island.points(np.flatnonzero(counts >= LEAST_SUBMAPS))
 
 
 def _by_chance(

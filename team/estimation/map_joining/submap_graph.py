@@ -57,8 +57,9 @@ DRIFT: Mapping[Bias, float] = MappingProxyType(
 )
 """Scale of a robot's bias on another day about that of a saved map, in scales of its prior.
 
-Clock offsets and bearings are not carried over: a clock is set at each start, and remounting turns
-a sensor by more than the prior's scale. By Student's t a replaced sensor loses the tie.
+Optics and electronics of ranges age over months; the driven distance changes with tyres, load and
+floor. Clock offsets and bearings are not carried over: a clock is set at each start, and remounting
+turns a sensor by more than the prior's scale. By Student's t a replaced sensor loses the tie.
 """
 NONE_IN_COMMON: Mapping[CommonBias, float] = MappingProxyType({})
 NO_NUMBERS: Mapping[Key, Sequence[int]] = MappingProxyType({})

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from teamslam.team.config import FrontEnd, MotionModel, MotionNoise, Sensor
-from teamslam.team.core import POSE_JITTER, moments
+from teamslam.team.core import POSE_JITTER, moments, sample_factor
 from teamslam.team.estimation.consistency import nees
 from teamslam.team.estimation.gaussian import cholesky_factor
 from teamslam.team.estimation.hybrid_slam import window as windows
@@ -238,3 +238,12 @@ def test_a_pose_after_an_uncertain_turn_is_that_of_the_odometry_and_no_mean_of_c
     assert abs(local.mean[0] - 10.0) < 1e-3
     assert local.covariance[0, 0] < 1e-3
     np.testing.assert_allclose(local.covariance[1:3, 1:3], alone.covariance[1:, 1:], rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("weights", "factor"),
+    [([0.1, 0.1] + [0.05] * 16, 1.0 / (1.0 - 5.0 * 0.06)), ([0.1] * 10, 2.0), ([1.0], 2.0)],
+    ids=["unequal ones count for fewer", "ten", "one"],
+)
+def test_the_scatter_of_few_or_unequal_particles_is_taken_times_at_most_two(weights, factor):
+    assert sample_factor(np.array(weights)) == pytest.approx(factor)
