@@ -336,12 +336,12 @@ def verify_ledger(
     sheets = [disposition_sheet({robot: found.totals(robot) for robot in robots})]
     if lists:
         sheets += [sheet for sheet in rejection_sheets(found) if sheet.rows]
-    elif found.rejected or found.outliers:
-        click.echo("--list shows each rejected measurement with its reason")
     for sheet in sheets:
         print_table(terminal_table(sheet))
     used = sum(1 for maps in found.maps.values() if maps)
     click.echo(f"{len(found.maps)} submaps, {used} of them in a map")
+    if not lists and (found.rejected or found.outliers):
+        click.echo("--list shows each rejected measurement with its reason")
     if not opened.complete:
         click.echo(f"{log} is cut: measurements after the cut count as lost", err=True)
     opt.write_json(json_file, found.to_json())

@@ -4,7 +4,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -63,10 +62,9 @@ class RecordedMeasurements(Mapping[int, m.Measurement]):
         """Greatest number."""
         return max(self._messages)
 
-    def steps(self, end: int) -> list[int]:
-        """Count the odometry intervals before each of the measurements 0 … end."""
-        get = self._messages.get
-        return [0, *accumulate(type(get(number)) in m.ODOMETRY for number in range(end))]
+    def odometry(self) -> list[int]:
+        """Numbers of the odometry intervals, ascending."""
+        return sorted(number for number, x in self._messages.items() if type(x) in m.ODOMETRY)
 
     def consecutive(self, begin: int, end: int) -> Iterator[m.Measurement]:
         """Yield measurements begin … end − 1, up to the first gap."""

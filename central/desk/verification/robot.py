@@ -1,5 +1,6 @@
 """Recompute one robot's messages: its node over its recorded measurements."""
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import takewhile
@@ -149,10 +150,11 @@ def _chain(log: Recorded, robot: str, incarnation: int) -> list[m.Submap]:
 def _first_of(done: m.Done, chain: Sequence[m.Submap], measurements: RecordedMeasurements) -> int:
     """Number of a process's first measurement: `done.steps` odometry intervals before its last."""
     last = min(done.measurements, measurements.last + 1)
-    steps = measurements.steps(last)
+    odometry = measurements.odometry()
+    before_last = bisect_left(odometry, last)
     begins = {0, *(submap.last_measurement + 1 for submap in chain)}
     for counter in sorted((each for each in begins if each <= last), reverse=True):
-        if steps[last] - steps[counter] == done.steps:
+        if before_last - bisect_left(odometry, counter) == done.steps:
             return counter
     return 0
 

@@ -4,11 +4,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teamslam.central.desk.verification.recorded import Recorded, RecordedMeasurements
+from teamslam.central.desk.verification.robot import _first_of
 from teamslam.team.wire import channels as ch
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
-from tests import build
+from tests import build, support
 
 numbers = st.integers(0, 12)
 
@@ -58,6 +59,18 @@ def test_it_is_the_table_of_the_first_message_of_each_number(log, chunk, begin, 
     consecutive = [*there.consecutive(begin, end)]
     last = next((n for n in range(begin, end) if n not in table), end)
     assert consecutive == [table[n] for n in range(begin, last)]
+
+
+def test_a_far_number_costs_no_time_where_the_first_measurement_of_a_process_is_found():
+    far = 2**40
+    there = RecordedMeasurements()
+    for number in (1, 9, 10, 11, far):
+        there.put(build.odometry(**name_of(number), duration_ns=10))
+    assert there.odometry() == [1, 9, 10, 11, far]
+    done = build.done(stamp_ns=9, measurements=far + 1, steps=3, submaps=1, ledger=())
+    chain = [support.submap(0)]  # of the measurements 0 to 9
+    assert _first_of(done, chain, there) == 10
+    assert _first_of(msgspec.structs.replace(done, steps=5), chain, there) == 0
 
 
 def test_unsound_odometry_is_counted_and_another_robots_is_not_taken():
