@@ -8,10 +8,12 @@ from typing import Any
 
 import msgspec
 
+from teamslam.sim.datasets import folder_files, graph, tables
+from teamslam.sim.datasets import unlabelled as unlabelled_files
 from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_files import robots_of, scenario_in
 from teamslam.sim.datasets.graph import graph_world
-from teamslam.sim.datasets.kinds import FORMATS, UTIAS_MARKER, kind_of
+from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.datasets.tables import open_data_set as open_files
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
@@ -39,6 +41,13 @@ READERS: Mapping[type, Callable[[Any, Scenario], WorldStreams]] = {
     GraphWorld: lambda world, scenario: graph_world(world, len(scenario.robots)),
 }
 """Reader of each kind of data set."""
+EXPECTED: Mapping[type, str] = {
+    UtiasWorld: tables.EXPECTED,
+    FolderWorld: folder_files.EXPECTED,
+    UnlabelledWorld: unlabelled_files.EXPECTED,
+    GraphWorld: graph.EXPECTED,
+}
+"""Description of each kind of data set, for errors."""
 
 
 def streams_of(scenario: Scenario) -> WorldStreams:
@@ -57,7 +66,8 @@ def streams_of(scenario: Scenario) -> WorldStreams:
         hides = world.identities == "hidden" or world.missed > 0.0
         return with_hidden_identities(streams, hiding, seed) if hides else streams
     if not world.path:
-        raise DatasetError(f"no data set given: name it with --dataset or world.path; {FORMATS}")
+        expected = EXPECTED[type(world)]
+        raise DatasetError(f"no data set given: name it with --dataset or world.path; {expected}")
     streams = READERS[type(world)](world, scenario)
     known = (
         replace(each, start=None) if starts_unknown(world, each.robot) else each
