@@ -1142,7 +1142,7 @@ class Scan:
 
     def __init__(self, ids: NDArray[numpy.uint32], ranges: NDArray[numpy.float64], bearings: NDArray[numpy.float64], own: NDArray[numpy.float64] | None = None) -> None:
         """
-        own: (n, 4) covariances of the measurements, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.
+        own: (n, 4) covariances of the measurements, as of `teamslam.team.estimation.models`; (n, 0) or None: none.
         """
 
     @staticmethod

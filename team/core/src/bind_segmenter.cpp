@@ -91,7 +91,7 @@ void bind_scans(nb::module_& m) {
             new (self) Measurements(std::move(scan));
           },
           "ids"_a.noconvert(), "ranges"_a, "bearings"_a, "own"_a = nb::none(),
-          "own: (n, 4) covariances of the measurements, as of `teamslam.team.estimation.scans`; (n, 0) or None: none.")
+          "own: (n, 4) covariances of the measurements, as of `teamslam.team.estimation.models`; (n, 0) or None: none.")
       .def_static(
           "polar",
           [](const nb::bytes& ids, const nb::bytes& ranges, const nb::bytes& bearings, const nb::bytes& covariances) {

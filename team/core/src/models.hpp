@@ -32,7 +32,7 @@ struct Noise {
   bool is_white() const { return range_white == 1.0 && bearing_white == 1.0; }
 };
 
-// The covariance that a measurement brings: a row of `own` in team/estimation/scans.py.
+// The covariance that a measurement brings: a row of `own` in team/estimation/models.py.
 struct Claim {
   double rr, rb, bb, form;
 
