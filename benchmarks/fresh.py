@@ -16,8 +16,7 @@ import numpy as np
 
 from benchmarks.baseline import conclude, parser_of
 from teamslam.team.recording.reader import open_log
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import opened
 
 CHANNELS = (ch.SUBMAP, ch.FUSED_MAP, ch.PRIOR, ch.CENTRAL_PROGRESS, ch.STATUS)

@@ -29,8 +29,7 @@ from teamslam.team.containment import Boundary
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import load_roster, nodes_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus

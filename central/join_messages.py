@@ -24,8 +24,7 @@ from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.estimation.map_joining.marginals import BiasEstimate
 from teamslam.team.estimation.map_joining.minima import MISFIT, RIVAL
 from teamslam.team.estimation.map_joining.tick import describe_refusals
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 

@@ -17,8 +17,7 @@ from teamslam.team.core import packed, unpacked
 from teamslam.team.estimation.contribution import Stream, is_map, named
 from teamslam.team.estimation.map_joining.joining import EMPTY_FOLD, Fold
 from teamslam.team.estimation.map_joining.saved_maps import REMEDY
-from teamslam.team.wire import arrays
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import arrays, messages as m
 
 NOT_JOINED = " not joined: "
 

@@ -12,8 +12,7 @@ from teamslam.central.node import make_centre
 from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.set_file import SetFile
 from teamslam.team.shell import WAIT_S, MissingMeasurements, Shell, select_due
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import ids
 from teamslam.team.wire.bus import Bus, Sample, opened
 from teamslam.team.wire.codec import WireError, encoded

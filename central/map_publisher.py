@@ -11,8 +11,7 @@ from collections.abc import Collection, Mapping
 from teamslam.central.join_messages import Tail
 from teamslam.central.submap_fold import SubmapFold
 from teamslam.team.store import Stream
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 
 PATIENCE = 3.0

@@ -24,8 +24,7 @@ from teamslam.team.estimation.gaussian import NO_LANDMARKS
 from teamslam.team.pairs import RULES
 from teamslam.team.registry import load
 from teamslam.team.store import SubmapStore
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.digest import announce_configuration

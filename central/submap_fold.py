@@ -27,8 +27,7 @@ from teamslam.team.estimation.contribution import NO_OWN, is_map, whole_of
 from teamslam.team.estimation.map_joining import marginals
 from teamslam.team.estimation.map_joining.joining import Fold
 from teamslam.team.store import Stream, SubmapStore
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded, find_error
 from teamslam.team.wire.digest import digest_of

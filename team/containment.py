@@ -11,8 +11,7 @@ from types import TracebackType
 from typing import Protocol, TypeVar, runtime_checkable
 
 from teamslam.team.core import blake2b
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.logs import LOG, cut, one_line

@@ -17,18 +17,17 @@ from numpy.typing import ArrayLike
 
 from teamslam.team import core, translate
 from teamslam.team.config import BIASES, BiasSigmas, FrontEnd, MotionModel, MotionNoise, Sensor
-from teamslam.team.core import located
-from teamslam.team.core import predicted as measurement_of
+from teamslam.team.core import located, predicted as measurement_of
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor, Stream, named
 from teamslam.team.estimation.hybrid_slam import window as windows
 from teamslam.team.estimation.hybrid_slam.fastslam import (
     Particles,
     Proposal,
     StepInfo,
+    at_poses as particles_at,
     filter_step,
     resampled,
 )
-from teamslam.team.estimation.hybrid_slam.fastslam import at_poses as particles_at
 from teamslam.team.estimation.map_joining import joining, marginals
 from teamslam.team.estimation.map_joining.gauss_newton import JoinSettings
 from teamslam.team.estimation.map_joining.marginals import LandmarkMap, Trajectory
@@ -38,8 +37,7 @@ from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.registry import load
 from teamslam.team.shapes import Float, UInt32
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import WireError, decoded
 
 __all__ = [

@@ -17,8 +17,7 @@ import msgspec
 from teamslam.team.config import MAP
 from teamslam.team.containment import Boundary, reply_of
 from teamslam.team.end_query import EndQuery
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Answer, Bus, BusError, Outgoing, Sample, read_reply
 from teamslam.team.wire.codec import WireError, decoded
 from teamslam.team.wire.intervals import RequestTimes

@@ -15,8 +15,7 @@ from teamslam.sim.world.streams import Detections, Intervals, RobotStream, Start
 from teamslam.team.config import Exchange, FrontEnd, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.pairs import NEEDS_MAP
 from teamslam.team.robot.node import RobotNode, robot_node
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

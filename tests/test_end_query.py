@@ -1,8 +1,7 @@
 import pytest
 
 from teamslam.team.end_query import EndQuery
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Sample
 from teamslam.team.wire.codec import encoded
 from tests import build

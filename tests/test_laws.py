@@ -11,8 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import teamslam.sim.publisher.node
 import teamslam.team.robot.node
@@ -27,8 +26,7 @@ from teamslam.sim.studies.robots.node import ExchangingRobot
 from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
 from teamslam.team.robot.node import RobotNode, robot_node
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import NO_MAP, digest_of

@@ -8,8 +8,7 @@ import pytest
 
 from teamslam.team import shell
 from teamslam.team.shell import BACK_S, RECORDER, RECORDER_S, Shell, process
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from tests import build
 

@@ -9,8 +9,7 @@ from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.robot.ledger import IN_SIGHTING
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import encoded
 from tests.scenarios import with_front_ends, with_robots
 from tests.sim.reruns import messages, team_samples, thesis, written

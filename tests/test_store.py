@@ -2,8 +2,7 @@ import copy
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.team.store import SubmapStore
 from teamslam.team.wire import messages as m

@@ -14,8 +14,7 @@ from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team.rejection import REJECTED
 from teamslam.team.robot.ledger import IN_SIGHTING
 from teamslam.team.store import Stream
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import ids
 
 IN_SUBMAP, OPEN, LOST = "in a submap", "open", "lost"

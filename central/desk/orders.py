@@ -9,8 +9,7 @@ from teamslam.central.desk.evaluation.states import holds
 from teamslam.central.desk.names import in_order
 from teamslam.team.keys.roster import ROBOT
 from teamslam.team.peers.members import Member, about
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, open_valid
 from teamslam.team.wire.codec import encoded
 

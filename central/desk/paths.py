@@ -16,8 +16,7 @@ from teamslam.central.desk.verification.robot import run_alone
 from teamslam.team import translate
 from teamslam.team.estimation.hybrid_slam.window_path import Ends, placed
 from teamslam.team.shapes import Float, Int64
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, stamps
 
 

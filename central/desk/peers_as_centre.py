@@ -13,8 +13,7 @@ from typing import TypeVar
 import msgspec
 
 from teamslam.central.config import team_config
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, try_open
 from teamslam.team.wire.codec import WireError, decoded, encoded
 

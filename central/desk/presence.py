@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from statistics import median
 
 from teamslam.central.desk.names import in_order
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, open_valid
 from teamslam.team.wire.message_order import later_head
 

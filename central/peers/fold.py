@@ -11,8 +11,7 @@ from teamslam.central.node import CentralNode
 from teamslam.team.containment import Boundary
 from teamslam.team.door import MOST_COUNT
 from teamslam.team.peers.node import PeerNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
 

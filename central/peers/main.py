@@ -19,8 +19,7 @@ from teamslam.team.peers.proofs import Proofs
 from teamslam.team.peers.set_file import SetFile
 from teamslam.team.robot.main import SECOND_PATIENCE_S, RobotShell
 from teamslam.team.shell import Shell
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Tap
 
 if TYPE_CHECKING:

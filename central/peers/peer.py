@@ -8,8 +8,7 @@ from teamslam.team.containment import Boundary, sample_of
 from teamslam.team.peers.members import CHANNELS, Member, about
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.peers.proofs import OPERATOR, Proofs
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, open_valid
 from teamslam.team.wire.codec import decoded, encoded
 

@@ -15,8 +15,7 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.peers.members import CHANNELS, Member
 from teamslam.team.peers.proofs import Proofs, signed_by
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 

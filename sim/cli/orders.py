@@ -39,8 +39,7 @@ def withdraw(
 
     The order is recorded and cannot be undone.
     """
-    from teamslam.central.desk.orders import WithdrawError
-    from teamslam.central.desk.orders import withdraw as order
+    from teamslam.central.desk.orders import WithdrawError, withdraw as order
 
     opt.check_names(team, robot)
     with opt.connect_bus(team, connect, keys, "operator") as bus, failing(WithdrawError):

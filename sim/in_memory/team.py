@@ -16,8 +16,7 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.containment import Boundary
 from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.robot.node import RobotNode, robot_node
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration

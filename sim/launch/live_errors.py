@@ -9,8 +9,7 @@ from teamslam.central.desk.evaluation.running import (
     RunningErrors,
     TeamTruth,
 )
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 
 EVERY_NS = 1_000_000_000  # least team time between a robot's compared poses

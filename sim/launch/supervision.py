@@ -15,8 +15,7 @@ from teamslam.central.desk.orders import publish_order
 from teamslam.sim.launch.processes import Child, Ended, Used
 from teamslam.sim.launch.watch import TURN_S, Watch
 from teamslam.team.shell import describe_missing
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, BusError, Outgoing
 
 FRUITLESS = 5  # consecutive deaths without progress before a process is given up

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, Sample, open_printable
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.message_order import is_newer_map

@@ -10,8 +10,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.scenarios.source import tells_map
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.shell import Shell
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, Outgoing
 from teamslam.team.wire.digest import announce_configuration
 

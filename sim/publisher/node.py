@@ -18,8 +18,7 @@ from teamslam.team.driver.source import (
     FIRST_INCARNATION,
     answer_request,
 )
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded

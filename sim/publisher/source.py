@@ -8,8 +8,7 @@ import numpy as np
 from teamslam.sim.world import streams as s
 from teamslam.sim.world.streams import Detections, Intervals, RobotStream
 from teamslam.team.driver.source import FIRST_INCARNATION
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing
 

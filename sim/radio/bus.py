@@ -18,8 +18,7 @@ from teamslam.sim.world.config import Radio
 from teamslam.sim.world.streams import RobotStream
 from teamslam.team import core
 from teamslam.team.shapes import Bool, Float, Int64
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Answer, Bus, Outgoing, Sample, Tap
 from teamslam.team.wire.codec import WireError, decoded, encoded
 

@@ -18,8 +18,7 @@ from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting, PoseGri
 from teamslam.team.estimation.models import Increment, Own, noise, segmenter_of, unclaimed
 from teamslam.team.estimation.se2 import Pose, between, compose, inverse
 from teamslam.team.shapes import Float, Int64, UInt32
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.channels import channel_of
 

@@ -15,8 +15,7 @@ from teamslam.sim.scenarios.scenario import Scenario, with_options
 from teamslam.team.config import MAP, Alphas, MotionModel, MotionNoise, RobotConfig, Sensor
 from teamslam.team.pairs import FEEDBACK
 from teamslam.team.saved_map import read_map
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, open_valid
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of

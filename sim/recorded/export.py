@@ -36,8 +36,7 @@ from teamslam.team.core import predicted
 from teamslam.team.driver.source import FIRST_INCARNATION
 from teamslam.team.estimation.se2 import compose
 from teamslam.team.recording.reader import Log, LogError
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import try_open
 
 FLOOR = np.diag((1e-4, 2e-3, 1e-4)) ** 2

@@ -23,8 +23,7 @@ from teamslam.team import translate
 from teamslam.team.core import Scan
 from teamslam.team.recording.reader import LogError, open_log
 from teamslam.team.shapes import Float, Int64, UInt32
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
 from teamslam.team.wire.bus import opened
 

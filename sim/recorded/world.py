@@ -13,8 +13,7 @@ from teamslam.sim.scenarios.scenario import Scenario, loads
 from teamslam.sim.scenarios.source import open_data_set
 from teamslam.team.pairs import NEEDS_MAP
 from teamslam.team.recording.reader import open_log
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_floats
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.channels import Channel, channel_of

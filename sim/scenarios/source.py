@@ -8,14 +8,12 @@ from typing import Any
 
 import msgspec
 
-from teamslam.sim.datasets import folder_files, graph, tables
-from teamslam.sim.datasets import unlabelled as unlabelled_files
+from teamslam.sim.datasets import folder_files, graph, tables, unlabelled as unlabelled_files
 from teamslam.sim.datasets.folder import folder
 from teamslam.sim.datasets.folder_files import robots_of, scenario_in
 from teamslam.sim.datasets.graph import graph_world
 from teamslam.sim.datasets.kinds import UTIAS_MARKER, kind_of
-from teamslam.sim.datasets.tables import DatasetError
-from teamslam.sim.datasets.tables import open_data_set as open_files
+from teamslam.sim.datasets.tables import DatasetError, open_data_set as open_files
 from teamslam.sim.datasets.unlabelled import is_car, unlabelled
 from teamslam.sim.datasets.utias import ROBOTS, present_robots, utias
 from teamslam.sim.scenarios.document import ScenarioError

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from teamslam.team.config import Bounds
-from teamslam.team.driver import journal as j
-from teamslam.team.driver import measurement_messages as make
+from teamslam.team.driver import journal as j, measurement_messages as make
 from teamslam.team.driver.link import Link
 from teamslam.team.driver.measurement_messages import (
     DriverWarning,

@@ -14,8 +14,7 @@ from teamslam.team.driver.node import SourceNode
 from teamslam.team.end_query import EndQuery
 from teamslam.team.keys.roster import KeysError
 from teamslam.team.shell import Shell
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import BusError
 from teamslam.team.wire.zenoh.bus import ZenohBus
 

@@ -15,8 +15,7 @@ from teamslam.team.driver.source import (
     answer_request,
     channel_of,
 )
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable
 
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import encoded
 
 CREDIT_MEASUREMENTS = 4096

@@ -8,12 +8,12 @@ import numpy as np
 from teamslam.team.core import (
     cholesky,
     forward,
+    inverse_matrix as inverse,
     inverse_of_factored,
     product,
     solve,
     solve_factored,
 )
-from teamslam.team.core import inverse_matrix as inverse
 from teamslam.team.shapes import Float
 
 __all__ = [

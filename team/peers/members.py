@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from teamslam.team.core import blake2b
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened
 
 STREAMED = (ch.START, ch.SUBMAP, ch.SIGHTING_FACTOR)

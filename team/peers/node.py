@@ -13,8 +13,7 @@ from teamslam.team.peers.members import CHANNELS, Member, member_of
 from teamslam.team.peers.proofs import Proofs
 from teamslam.team.peers.replica import RefusedError, Replica
 from teamslam.team.store import Stream
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import WireError, decoded, encoded
 

@@ -18,8 +18,7 @@ from teamslam.team.recording.reader import Log
 from teamslam.team.recording.recorder import Declaration, schema_of
 from teamslam.team.recording.records import check_index
 from teamslam.team.shapes import Int64
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, opened, try_open
 from teamslam.team.wire.codec import WireError
 from teamslam.team.wire.intervals import Interval, IntervalSet, describe_intervals

@@ -14,8 +14,7 @@ from zlib import crc32
 
 import msgspec
 
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import NO_COUNTER, Sample, try_open
 from teamslam.team.wire.intervals import describe_intervals
 

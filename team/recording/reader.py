@@ -17,8 +17,7 @@ import msgpack
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel as LogChannel
-from mcap.records import Metadata, Schema
+from mcap.records import Channel as LogChannel, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from teamslam.team.recording.recorder import METADATA, Declaration

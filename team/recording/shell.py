@@ -12,8 +12,7 @@ from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.inventory import MISSING, Inventory, NumberedStream
 from teamslam.team.recording.reader import LOG_ID
 from teamslam.team.recording.recorder import Recorder, RecorderError
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, open_valid
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.intervals import RequestTimes, describe_intervals

@@ -14,8 +14,7 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.containment import reply_of
 from teamslam.team.robot.node import robot_node
 from teamslam.team.shell import ASK_TIMEOUT_S, RECORDER, MissingMeasurements, Shell
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, BusError, Sample, Tap
 from teamslam.team.wire.codec import WireError, decoded, encoded
 

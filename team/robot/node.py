@@ -27,8 +27,7 @@ from teamslam.team.robot.mapper import Mapper, Replaced
 from teamslam.team.robot.poses import RunningPoses
 from teamslam.team.robot.status import status_of
 from teamslam.team.robot.stream import EndOfStream, Inbox
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import find_error
 from teamslam.team.wire.digest import announce_configuration

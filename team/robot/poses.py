@@ -18,8 +18,7 @@ from teamslam.team.estimation.plausibility import prior_beyond
 from teamslam.team.robot.maps import TeamMap
 from teamslam.team.robot.statements import MessageWriter
 from teamslam.team.robot.submaps import Submaps
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.message_order import is_newer_prior
 

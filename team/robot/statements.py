@@ -14,8 +14,7 @@ from teamslam.team.estimation.hybrid_slam.pose_grid import NodeSighting
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Innovation
 from teamslam.team.estimation.submap import Became
 from teamslam.team.robot.maps import Cloud
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.digest import NO_MAP

@@ -5,8 +5,7 @@ from typing import Literal
 from teamslam.team.config import Estimator
 from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.robot.mapper import Mapper
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 
 UNEXPECTED = 3.0
 """NIS per degree of freedom above which measurements contradict the models: 1 is right; 5 % of

@@ -8,8 +8,7 @@ from teamslam.team.door import (
     absurd,
     another_time,
 )
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.message_order import later_head, merge_ends
 
 NEAR_LIVES = 16  # largest accepted step of the incarnation

@@ -17,8 +17,7 @@ import msgspec
 from teamslam.team import translate
 from teamslam.team.config import Exchange
 from teamslam.team.estimation.submap import LocalMap
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
 

@@ -9,8 +9,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import msgspec
 
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.channels import Channel, channel_of, row_of
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from teamslam.team.wire.logs import LOG, make_printable

@@ -15,8 +15,7 @@ from teamslam.team import translate
 from teamslam.team.estimation.map_joining.marginals import BELIEVED, bias_estimates, joint_cost
 from teamslam.team.estimation.map_joining.minima import MISFIT
 from teamslam.team.estimation.se2 import compose, inverse
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
 from teamslam.team.wire.bus import opened
 from tests.central.test_withdrawal import messages, scenario, team_run

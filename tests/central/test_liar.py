@@ -21,8 +21,7 @@ from teamslam.team.estimation.map_joining.condensed import SubmapCosts
 from teamslam.team.estimation.map_joining.joining import solve_fold
 from teamslam.team.estimation.map_joining.marginals import Agreement, landmark_map
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_floats, stamps
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from tests.central.test_withdrawal import assert_map_without, messages, of_set, scenario, team_run

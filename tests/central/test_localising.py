@@ -18,8 +18,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team import translate
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.saved_map import write_map
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_ids, ids
 from teamslam.team.wire.codec import encoded
 from tests.central.test_saved_map import day, elsewhere, first_day, numbers, part, with_means

@@ -11,8 +11,7 @@ from teamslam.central.submap_fold import SubmapFold
 from teamslam.team import translate
 from teamslam.team.config import UNNAMED
 from teamslam.team.estimation.map_joining.marginals import LandmarkBlocks
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_ids, ids
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

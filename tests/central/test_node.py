@@ -7,8 +7,7 @@ from teamslam.central.attendance import TeamAttendance
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import CentralNode, make_centre
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.teams import Submaps, config, driven, of, published, stream

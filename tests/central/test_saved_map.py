@@ -24,8 +24,7 @@ from teamslam.team.estimation.map_joining.alignment import Maps, align, procrust
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.saved_map import SavedMapError, map_figures, read_map, write_map
 from teamslam.team.store import SubmapStore
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_floats, ids
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import WireError, decoded, encoded

@@ -4,15 +4,13 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import CentralNode
 from teamslam.team.driver.node import SourceNode
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_ids, ids
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.message_order import is_newer_map

@@ -28,8 +28,7 @@ from teamslam.team.estimation.map_joining.marginals import (
     joint_cost,
     landmark_map,
 )
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests import build

@@ -5,8 +5,7 @@ Results of a window are tested in tests/estimation/hybrid_slam.
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.team import core
 

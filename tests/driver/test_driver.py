@@ -9,8 +9,7 @@ import pytest
 
 from teamslam import Driver, DriverError, DriverWarning, MeasurementError
 from teamslam.team.saved_map import write_map
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Outgoing, opened
 from teamslam.team.wire.codec import decoded, encoded

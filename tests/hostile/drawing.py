@@ -15,8 +15,7 @@ from teamslam.central.config import CentralConfig
 from teamslam.central.node import CentralNode
 from teamslam.team.config import RobotConfig
 from teamslam.team.robot.node import RobotNode, robot_node
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import WireError, decoded, encoded

@@ -11,8 +11,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Message
 from mcap.writer import CompressionType, Writer
 
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.codec import encoded
 from tests import build

@@ -19,8 +19,7 @@ from teamslam.team.robot.mapper import Mapper
 from teamslam.team.robot.node import RobotNode
 from teamslam.team.shell import FaultyRunError, Shell
 from teamslam.team.store import SubmapStore
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests import build

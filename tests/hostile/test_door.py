@@ -8,8 +8,7 @@ from teamslam.team.config import RobotConfig
 from teamslam.team.containment import Boundary, Handler
 from teamslam.team.door import LATE_NS, MOST_COUNT, MOST_LIVES, Door
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample, read_reply
 from teamslam.team.wire.codec import WireError, encoded
 from teamslam.team.wire.digest import announce_configuration

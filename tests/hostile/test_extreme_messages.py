@@ -27,13 +27,11 @@ from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.shell import RecordLoop
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
-from tests.hostile.drawing import CHANNELS, ROBOTS, S, mutated
-from tests.hostile.drawing import extreme_samples as samples
+from tests.hostile.drawing import CHANNELS, ROBOTS, S, extreme_samples as samples, mutated
 
 COUNT = int(os.environ.get("TEAMSLAM_STORM", "6"))
 MOST_MIB = 150  # growth of the process over all messages of one type

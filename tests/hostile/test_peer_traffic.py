@@ -10,8 +10,7 @@ from teamslam.team.peers.members import LARGEST_SIGNATURE
 from teamslam.team.peers.node import MOST_OPEN, PATIENCE_S, PeerNode
 from teamslam.team.peers.replica import MOST_INTERVALS, MOST_STREAMS
 from teamslam.team.peers.set_file import SetFile
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import WireError, decoded, encoded
 from tests import build
 from tests.peers.teams import member, parcel, start

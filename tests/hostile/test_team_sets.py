@@ -7,8 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from teamslam.central.config import CentralConfig
 from teamslam.team.wire import messages as m

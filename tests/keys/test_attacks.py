@@ -20,8 +20,7 @@ from teamslam.team.end_query import EndQuery
 from teamslam.team.keys.authority import make_keys
 from teamslam.team.keys.credentials import credentials_of
 from teamslam.team.keys.roster import load_roster, nodes_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened, read_reply
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh import session

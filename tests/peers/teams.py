@@ -8,8 +8,7 @@ import msgspec
 
 from teamslam.team.peers.members import Member, about
 from teamslam.team.peers.node import PeerNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

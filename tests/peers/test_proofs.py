@@ -14,8 +14,7 @@ from teamslam.team.keys.signing import Signer
 from teamslam.team.peers.members import Member
 from teamslam.team.peers.node import PeerNode
 from teamslam.team.peers.proofs import OPERATOR, Proofs, sign_order
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build
 from tests.peers.teams import member, parcel, start

@@ -12,8 +12,7 @@ from teamslam.team.peers.exchange import MOST_ASKED, make_request
 from teamslam.team.peers.members import LARGEST_MEMBER, Member, member_of
 from teamslam.team.peers.node import GIVEN_BYTES, PeerNode
 from teamslam.team.peers.replica import MOST_SEQUENCES, RefusedError, Replica
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

@@ -12,8 +12,7 @@ import pytest
 from teamslam.team.peers.members import member_of
 from teamslam.team.peers.replica import Replica
 from teamslam.team.peers.set_file import MAGIC, SetFile, SetFileError, record_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.peers.teams import said

@@ -2,8 +2,7 @@ from pathlib import Path
 
 from teamslam.team.recording.reader import Log, open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 from tests.support import examples, on_its_key

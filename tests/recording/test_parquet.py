@@ -7,8 +7,7 @@ import pytest
 
 from teamslam.sim.cli import log as cli_log
 from teamslam.team.recording.tables import ParquetTable, export_tables, numbers_of, table_of
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.bus import Sample
 from tests.commands import output_of
 from tests.recording.logs import recorded, recorded_examples, sampled

@@ -18,8 +18,7 @@ from teamslam.team.recording.reader import LogError, open_log, part_of, parts_of
 from teamslam.team.recording.recorder import Recorder, RecorderError
 from teamslam.team.recording.records import read_frames
 from teamslam.team.recording.shell import RecordLoop
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus

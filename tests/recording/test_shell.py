@@ -8,8 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.team import shell
 from teamslam.team.recording import recorder as recorder_module
@@ -20,8 +19,7 @@ from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.recording.shell import RecordLoop, replay, schedule
 from teamslam.team.shell import Shell
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.bus import Bus, MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import decoded, encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus

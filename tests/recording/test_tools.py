@@ -7,8 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from teamslam.team.recording.check import DRAWN, Counters, check_log, find_misdeclaration
@@ -16,8 +15,7 @@ from teamslam.team.recording.editing import MERGED, cut, merge, summarise_log
 from teamslam.team.recording.reader import Log, LogError, open_log
 from teamslam.team.recording.recorder import Recorder, schema_of
 from teamslam.team.recording.tables import export_tables, table_of
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.arrays import from_derivatives, from_floats, from_ids
 from teamslam.team.wire.bus import NO_COUNTER, Sample
 from teamslam.team.wire.codec import encoded

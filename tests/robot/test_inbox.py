@@ -1,6 +1,5 @@
 import msgspec
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.team.door import LATE_NS
 from teamslam.team.robot.stream import Inbox

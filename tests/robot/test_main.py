@@ -7,8 +7,7 @@ import pytest
 
 from teamslam.team.recording.parts import own_log
 from teamslam.team.robot.main import RobotShell
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import BusError, MemoryBus, MemoryNetwork, Outgoing, Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

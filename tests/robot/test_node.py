@@ -5,8 +5,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.team.config import FrontEnd
 from teamslam.team.estimation.hybrid_slam.window import ClosedWindow
@@ -15,10 +14,8 @@ from teamslam.team.pairs import PAIRS
 from teamslam.team.rejection import Rejection
 from teamslam.team.robot import node as robot_node
 from teamslam.team.robot.maps import CONDENSED
-from teamslam.team.robot.node import RobotNode
-from teamslam.team.robot.node import robot_node as node_for
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.robot.node import RobotNode, robot_node as node_for
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

@@ -7,8 +7,7 @@ from teamslam.central.desk.verification.verification import verify
 from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import opened
 from teamslam.team.wire.codec import encoded
 from tests import build

@@ -12,8 +12,7 @@ from teamslam.team.config import UNNAMED
 from teamslam.team.driver import measurement_messages
 from teamslam.team.driver.measurement_messages import MeasurementError
 from teamslam.team.rejection import Rejection
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import ids, octets, stamps
 from teamslam.team.wire.bus import opened
 from tests.scenarios import with_world

@@ -15,8 +15,7 @@ from teamslam.team.ros2.keys import of_rmw, of_token, publication
 from teamslam.team.ros2.topics import RobotTopics
 from teamslam.team.ros2_answers import Answer, Answers, LiveAnswers, RosPublisher
 from teamslam.team.translate import landmark_blocks_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded

@@ -10,8 +10,7 @@ from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team import translate
 from teamslam.team.config import MotionModel, MotionNoise, RobotConfig, Sensor
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded

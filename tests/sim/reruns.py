@@ -11,8 +11,7 @@ from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.reader import Log, open_log
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests.scenarios import with_front_ends, with_world

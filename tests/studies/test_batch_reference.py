@@ -5,8 +5,7 @@ import gtsam
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.stats import chi2
 
 from teamslam.sim.recorded.chains import BatchReferenceError, Chain, Scan, chains_of

@@ -8,8 +8,7 @@ import pytest
 import yaml
 
 from teamslam.team.recording.reader import open_log
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import opened
 from tests.namespaces import network
 from tests.support import ROOT

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from teamslam.sim.launch.supervision import FRUITLESS
 from teamslam.team.recording.reader import LogError, open_log
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import opened
 from tests.system.observer import Observer, endpoint_of
 from tests.system.processes import Process, Processes, until

@@ -4,8 +4,7 @@ from pathlib import Path
 
 from teamslam.sim.scenarios.scenario import load
 from teamslam.team.recording.reader import open_log
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import decoded
 from tests.support import Link
 from tests.system.observer import Observer

@@ -21,8 +21,7 @@ import matplotlib.pyplot as plt
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.sim.world.streams import RobotStream
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.codec import decoded
 from tests.air import air_of

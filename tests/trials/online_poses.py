@@ -24,8 +24,7 @@ from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import opened
 from tests.trials.online_bound import FAR, bounds, longest_s
 

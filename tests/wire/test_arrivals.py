@@ -1,7 +1,6 @@
 import itertools
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from teamslam.team.wire.intervals import PATIENCE_S, IntervalSet
 from teamslam.team.wire.zenoh import recovery as module

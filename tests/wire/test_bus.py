@@ -5,8 +5,7 @@ from itertools import count
 
 import pytest
 
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.bus import (
     NO_COUNTER,
     Bus,

@@ -9,8 +9,7 @@ import msgpack
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from teamslam.team.config import UNNAMED
 from teamslam.team.core import check_packed_covariance, check_pose_covariance

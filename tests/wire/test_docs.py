@@ -10,9 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
-from teamslam.team.wire import views as v
+from teamslam.team.wire import channels as c, messages as m, views as v
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.zenoh.bus import ZenohBus

@@ -1,9 +1,7 @@
 import logging
 
 from teamslam.sim.launch.watch import Watch
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import logs
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, logs, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, open_printable
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.logs import make_printable, one_line, printable_lines

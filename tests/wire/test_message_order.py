@@ -1,6 +1,5 @@
 import msgspec
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from teamslam.team.wire import messages as m
 from teamslam.team.wire.message_order import (

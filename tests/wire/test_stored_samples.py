@@ -1,8 +1,7 @@
 import msgspec
 import pytest
 
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, read_reply
 from teamslam.team.wire.codec import WireError, encoded
 from teamslam.team.wire.zenoh.stored_samples import StoredMessages

@@ -11,12 +11,10 @@ import zenoh
 
 from teamslam.team import end_query
 from teamslam.team.end_query import EndQuery
-from teamslam.team.wire import channels as c
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as c, messages as m
 from teamslam.team.wire.bus import BusError, Outgoing, Sample, opened
 from teamslam.team.wire.codec import LARGEST_PAYLOAD, decoded, encoded
-from teamslam.team.wire.zenoh import bus as zenoh_bus
-from teamslam.team.wire.zenoh import recovery as recovery_module
+from teamslam.team.wire.zenoh import bus as zenoh_bus, recovery as recovery_module
 from teamslam.team.wire.zenoh.bus import ZenohBus
 from teamslam.team.wire.zenoh.delivery import Attachment, pack, unpack
 from teamslam.team.wire.zenoh.recovery import Recovery

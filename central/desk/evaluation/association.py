@@ -14,8 +14,7 @@ import numpy as np
 from teamslam.central.desk.evaluation.log import Collected
 from teamslam.team.config import UNNAMED
 from teamslam.team.shapes import Int64
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import ids, stamps
 
 Place = tuple[str, int, int, int]

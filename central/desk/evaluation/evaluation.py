@@ -53,8 +53,7 @@ from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.check import MOST_HOLES, Finding
 from teamslam.team.recording.reader import Log
 from teamslam.team.shapes import Bool, Float, Int64
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, stamps
 from teamslam.team.wire.bus import Sample
 

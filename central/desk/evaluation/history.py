@@ -16,8 +16,7 @@ from teamslam.central.desk.logged import Logged, read_logged
 from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import PeersAsCentre
 from teamslam.team.shapes import Float, Int64
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 
 S = TypeVar("S")

@@ -18,8 +18,7 @@ from teamslam.central.desk.names import in_order
 from teamslam.central.desk.peers_as_centre import Agreement, PeersAsCentre, as_centre_final
 from teamslam.team import translate
 from teamslam.team.config import SURVEY_FRAME
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, with_printable_texts
 from teamslam.team.wire.channels import Channel, channel_of
 

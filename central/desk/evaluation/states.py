@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from teamslam.central.desk.names import in_order, not_joined
 from teamslam.team.config import MAP
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 
 if TYPE_CHECKING:  # a launch gives orders without NumPy
     from teamslam.central.desk.evaluation.log import Collected

@@ -22,8 +22,7 @@ from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.ros2 import encoding as ros
 from teamslam.team.ros2.bags import new_bag
 from teamslam.team.ros2_answers import Answer, Answers
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import try_open
 
 TEAM_SPACE = "/teamslam"  # namespace of the team's map and diagnostics

@@ -26,8 +26,7 @@ from teamslam.team.estimation.dense import diagonal_blocks
 from teamslam.team.geodesy import geodetic_from_local
 from teamslam.team.recording.reader import Log, LogError
 from teamslam.team.shapes import Float
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import ids
 
 MAP_COLUMNS = (

@@ -14,8 +14,7 @@ from teamslam.central.node import node_class
 from teamslam.central.submap_fold import RecordedFields, SubmapFold
 from teamslam.team.pairs import RULES
 from teamslam.team.store import Stream, SubmapStore
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 
 

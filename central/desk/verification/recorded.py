@@ -16,8 +16,7 @@ from teamslam.team.estimation.hybrid_slam.window_path import WindowPath
 from teamslam.team.former_names import with_current_names
 from teamslam.team.recording.reader import Log
 from teamslam.team.store import Stream
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 
 M = TypeVar("M", bound=m.Message)

@@ -22,8 +22,7 @@ from teamslam.team.pairs import FEEDBACK
 from teamslam.team.registry import load
 from teamslam.team.robot.node import robot_node
 from teamslam.team.robot.poses import PoseEstimator, RunningPoses, outside_team_frame
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 
 LOCKSTEP = "teamslam.sim.studies.robots.node:in_lockstep"

@@ -32,8 +32,7 @@ from teamslam.team.recording.parts import OWN
 from teamslam.team.recording.provenance import provenance
 from teamslam.team.recording.reader import Log
 from teamslam.team.recording.tables import numbers_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.codec import encoded
 
 RELATIVE = 1e-6

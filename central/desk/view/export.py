@@ -16,8 +16,7 @@ from teamslam.team.end_query import EndQuery
 from teamslam.team.recording.reader import Log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.shell import STATUS_S, WAIT_S, judge
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Bus, Outgoing, Sample, try_open
 from teamslam.team.wire.messages import FusedMap, Status
 

@@ -23,9 +23,7 @@ from teamslam.central.desk.view import foxglove_scene as fox
 from teamslam.central.desk.view.drawn import Landmarks, Track, centre_particles, landmarks_of
 from teamslam.team.estimation.se2 import Pose, compose
 from teamslam.team.shapes import Float
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
-from teamslam.team.wire import views
+from teamslam.team.wire import channels as ch, messages as m, views
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.channels import Channel
 

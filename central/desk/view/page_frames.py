@@ -32,8 +32,7 @@ from teamslam.central.desk.view.drawn import Landmarks, centre_particles, landma
 from teamslam.central.desk.view.node import FORGET_NS, ViewerNode
 from teamslam.central.unnamed_landmarks import SHOWN, STEPS
 from teamslam.team.shapes import Float
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, ids, stamps
 from teamslam.team.wire.bus import Sample
 

@@ -19,8 +19,7 @@ from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
 from teamslam.team.shapes import Float, UInt32
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Sample, opened
 

@@ -43,8 +43,7 @@ from teamslam.team.estimation.gaussian import LandmarkGaussian
 from teamslam.team.estimation.map_joining import joining
 from teamslam.team.estimation.models import corrected
 from teamslam.team.shapes import Float
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample, opened
 
 STEP_S = 1.0

@@ -29,8 +29,7 @@ from teamslam.sim.world.config import UtiasWorld
 from teamslam.team import translate
 from teamslam.team.config import MotionModel, RobotConfig, Sensor
 from teamslam.team.shapes import Float
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats
 from teamslam.team.wire.bus import Sample
 

@@ -22,8 +22,7 @@ from teamslam.sim.world.config import SimulatedWorld
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import Estimator, Exchange, FusionRule, RobotConfig
 from teamslam.team.robot.node import RobotNode, robot_node
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 
 Figures = dict[str, Any]

@@ -34,8 +34,8 @@ from teamslam.sim.studies.experiments.xu import (
     Method,
     Panel,
     Reading,
+    task as curves_of,
 )
-from teamslam.sim.studies.experiments.xu import task as curves_of
 
 if TYPE_CHECKING:  # Matplotlib is slow to import
     from matplotlib.axes import Axes

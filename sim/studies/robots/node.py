@@ -17,8 +17,7 @@ from teamslam.team.config import Exchange, RobotConfig
 from teamslam.team.estimation.gaussian import LandmarkGaussian, NotACovarianceError
 from teamslam.team.robot import node as product
 from teamslam.team.robot.node import RobotNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 
 

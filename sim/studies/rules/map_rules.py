@@ -20,8 +20,7 @@ from teamslam.sim.studies.rules.map_fusion import (
 from teamslam.team import translate
 from teamslam.team.estimation.gaussian import NO_LANDMARKS, LandmarkGaussian
 from teamslam.team.store import Stream
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.digest import digest_of
 

@@ -28,8 +28,7 @@ from teamslam.team.estimation.gaussian import (
 from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.plausibility import start_beyond
 from teamslam.team.estimation.se2 import Pose, inverse
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.digest import NO_MAP, digest_of
 

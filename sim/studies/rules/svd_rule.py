@@ -31,8 +31,7 @@ from teamslam.team.estimation.plausibility import start_beyond, submap_beyond
 from teamslam.team.estimation.se2 import Pose
 from teamslam.team.estimation.submap import LocalMap
 from teamslam.team.store import Stream, SubmapStore
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import digest_of

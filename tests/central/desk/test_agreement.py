@@ -13,8 +13,7 @@ from teamslam.sim.launch.watch import Watch
 from teamslam.team.config import RobotConfig
 from teamslam.team.recording.reader import Tail
 from teamslam.team.recording.recorder import Recorder
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Sample
 from teamslam.team.wire.codec import encoded
 from teamslam.team.wire.digest import announce_configuration

@@ -10,8 +10,7 @@ from teamslam.central.desk.evaluation.figures import association_json
 from teamslam.central.desk.evaluation.log import collect_log
 from teamslam.central.desk.evaluation.matching import assign, gospa, half_spacing
 from teamslam.team.config import UNNAMED
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Outgoing, Sample
 from teamslam.team.wire.codec import encoded
 from tests import build

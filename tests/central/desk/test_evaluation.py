@@ -2,8 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from msgspec.structs import replace
 
 from teamslam.central.desk.compare import compare_rows
@@ -19,8 +18,7 @@ from teamslam.central.desk.evaluation.figures import to_json
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.team.config import UNNAMED
 from teamslam.team.translate import joint_bytes
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Outgoing, Sample
 from tests import build

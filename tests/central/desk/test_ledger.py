@@ -10,8 +10,7 @@ import pytest
 from teamslam.central.desk.ledger import Ledger, Rejected, ledger
 from teamslam.central.desk.verification.recorded import index_log
 from teamslam.team.rejection import Rejection
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from teamslam.team.wire.bus import Sample
 from tests.commands import output_of

@@ -1,12 +1,10 @@
 import msgspec
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.central.desk.verification.recorded import Recorded, RecordedMeasurements
 from teamslam.central.desk.verification.robot import _first_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from tests import build, support

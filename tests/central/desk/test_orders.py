@@ -12,8 +12,7 @@ from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.orders import WithdrawError, give_up, judge, local_landmark, withdraw
 from teamslam.central.desk.report.tables import team_rows
 from teamslam.central.node import CentralNode
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing, Sample, opened
 from teamslam.team.wire.codec import encoded
 from tests import commands

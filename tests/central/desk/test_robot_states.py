@@ -13,8 +13,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.world.simulator import simulate
 from teamslam.team.containment import Boundary
 from teamslam.team.shell import FaultyRunError, judge
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

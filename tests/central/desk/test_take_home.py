@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from teamslam.central.desk import paths
-from teamslam.central.desk.evaluation.errors import Path as Poses
-from teamslam.central.desk.evaluation.errors import pose_errors
+from teamslam.central.desk.evaluation.errors import Path as Poses, pose_errors
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.export.take_home import (
     MAP_COLUMNS,

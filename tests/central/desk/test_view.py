@@ -21,9 +21,7 @@ from teamslam.team.recording.check import check_log
 from teamslam.team.recording.reader import open_log
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.shell import FaultyRunError
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
-from teamslam.team.wire import views
+from teamslam.team.wire import channels as ch, messages as m, views
 from teamslam.team.wire.arrays import from_floats
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork
 from teamslam.team.wire.codec import decoded, encoded

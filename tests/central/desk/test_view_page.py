@@ -38,8 +38,7 @@ from teamslam.sim.cli import view
 from teamslam.team.recording.reader import LogError, Tail
 from teamslam.team.recording.recorder import Recorder
 from teamslam.team.translate import joint_bytes, landmark_covariance_of
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids, from_stamps
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded

@@ -3,8 +3,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.scenarios.source import streams_of

@@ -4,8 +4,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.sim.in_memory.team import run_team

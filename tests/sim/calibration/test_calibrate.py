@@ -12,12 +12,10 @@ from teamslam.sim.calibration.claims import landmark_factor, mount_note, odometr
 from teamslam.sim.calibration.data import Reference, references, true_paths
 from teamslam.sim.calibration.figures import CalibrationError, Figure, jackknife, with_figures
 from teamslam.sim.calibration.join import join_team
-from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS
-from teamslam.sim.calibration.motion import fit_motion
+from teamslam.sim.calibration.motion import UNITS as MOTION_UNITS, fit_motion
 from teamslam.sim.calibration.own import marker_spread, own_constants
 from teamslam.sim.calibration.scenario import scenario_text
-from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS
-from teamslam.sim.calibration.sensor import fit_sensor
+from teamslam.sim.calibration.sensor import UNITS as SENSOR_UNITS, fit_sensor
 from teamslam.sim.datasets.utias import write_utias
 from teamslam.sim.scenarios.scenario import load
 from teamslam.sim.world.config import SimulatedWorld

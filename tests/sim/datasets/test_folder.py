@@ -12,8 +12,7 @@ from teamslam.sim.publisher.source import Source
 from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, load, with_options
 from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
 from teamslam.sim.world.config import FolderWorld
-from teamslam.sim.world.streams import FIXES as FIXES_KIND
-from teamslam.sim.world.streams import RobotStream, StartPose, WorldStreams
+from teamslam.sim.world.streams import FIXES as FIXES_KIND, RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.wire.arrays import floats
 from tests import teams

@@ -6,8 +6,7 @@ from teamslam.sim.in_memory.team import final_map, run_team
 from teamslam.sim.scenarios.scenario import load, with_options
 from teamslam.sim.scenarios.source import streams_of
 from teamslam.team.peers.members import Member, about
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import decoded, encoded
 from tests.air import Air, Meeting, meetings

@@ -8,8 +8,7 @@ from scipy.stats import chi2
 from teamslam.sim.launch import live
 from teamslam.sim.launch.live_errors import LiveErrors
 from teamslam.sim.launch.watch import Watch
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from tests import build
 
 

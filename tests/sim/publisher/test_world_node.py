@@ -4,8 +4,7 @@ import pytest
 from teamslam.sim.publisher import node as world_node
 from teamslam.sim.publisher.node import WorldNode, expected_nodes
 from teamslam.team.driver import source
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import floats, stamps
 from teamslam.team.wire.codec import decoded, encoded
 from tests import build

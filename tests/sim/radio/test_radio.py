@@ -3,8 +3,7 @@ import numpy as np
 
 from teamslam.sim.radio.bus import behind_radio, plan_of, reach_of
 from teamslam.sim.world.config import Radio, RadioWindow
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.bus import MemoryBus, MemoryNetwork, Outgoing
 from tests import build
 from tests.support import submap

@@ -18,8 +18,7 @@ from teamslam.sim.scenarios.document import ScenarioError
 from teamslam.team import translate
 from teamslam.team.pairs import PAIRS
 from teamslam.team.recording.reader import open_log
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import derivatives, floats, from_derivatives, from_floats
 from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded

@@ -3,8 +3,7 @@ import functools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.sim.studies.estimators import ekf_slam
 from teamslam.sim.studies.estimators.ekf_slam import EkfSlam

@@ -17,8 +17,7 @@ from teamslam.team.estimation.gaussian import NO_LANDMARKS
 from teamslam.team.estimation.hybrid_slam.window import generator
 from teamslam.team.estimation.models import Increment, corrected, increment_of
 from teamslam.team.robot.node import robot_node
-from teamslam.team.wire import channels as ch
-from teamslam.team.wire import messages as m
+from teamslam.team.wire import channels as ch, messages as m
 from teamslam.team.wire.arrays import from_floats, from_ids
 from tests.teams import LANDMARKS, LOCALISERS, config, driven, of, published, stream
 

@@ -2,8 +2,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.node import make_centre
