@@ -15,6 +15,7 @@ Kind = Literal[
 ]  # fmt: skip
 MOST = 2000  # most events of a run
 FIRST = 1
+CENTRAL = "central"
 _AWAITED = ("waiting for ", "has not appeared yet", "no measurements of this team yet")
 """Start-up states of a node, which are no events."""
 
@@ -47,6 +48,7 @@ class EventDetector:
     _members: set[str] = field(default_factory=set)
     _withdrawn: set[str] = field(default_factory=set)
     _reasons: dict[str, str] = field(default_factory=dict)
+    _said: set[str] = field(default_factory=set)  # gists of all reasons of maps
     _joined: set[str] = field(default_factory=set)
     _apart: set[str] = field(default_factory=set)
     _decided: set[tuple[int, str, str]] = field(default_factory=set)
@@ -137,17 +139,19 @@ class EventDetector:
         said = (*map(describe, fused.diagnosis), *fused.reasons)
         reasons = {without_decimals(each): each for each in said if not _is_apart(each)}
         for shape in sorted(reasons.keys() - self._reasons.keys()):
-            yield "warning", "central", reasons[shape]
+            if shape in self._said or (CENTRAL, shape) not in self._warned:
+                yield "warning", "central", reasons[shape]
         for shape in sorted(self._reasons.keys() - reasons.keys()):
             yield "map", "central", f"no longer: {self._reasons[shape]}"
         self._reasons = reasons
+        self._said |= reasons.keys()
         if fused.final:
             self._done |= set(self._alive)
             yield "done", "central", f"final map of {len(fused.ids) // 4} landmarks"
 
     def _status(self, status: m.Status) -> Found:
         refused = int(status.figures.get("refused", 0.0))
-        if refused > self._refused and status.node == "central":
+        if refused > self._refused and status.node == CENTRAL:
             yield "refused", "central", f"the centre refused {refused - self._refused} submaps"
             self._refused = refused
         for warning in status.warnings:
@@ -155,6 +159,8 @@ class EventDetector:
             if gist in self._warned or is_awaited(warning) or _is_apart(warning):
                 continue
             self._warned.add(gist)
+            if status.node == CENTRAL and gist[1] in self._said:
+                continue
             kind: Kind = "refused" if "refused" in warning else "warning"
             yield kind, status.node, f"{status.node}: {warning}"
 

@@ -89,6 +89,22 @@ def test_a_warning_whose_decimals_move_is_told_once_waiting_never_and_a_refusal_
     assert without_decimals("submap 20, cost 9.1") == "submap 20, cost #"
 
 
+@pytest.mark.parametrize("is_status_first", [True, False])
+def test_a_warning_of_the_map_and_of_the_centre_is_one_event_and_a_return_is_another(
+    is_status_first,
+):
+    reason, same = "r2's odometry is 2.3 % too short", "central: r2's odometry is 2.4 % too short"
+    both = (status(0, reason.replace("2.3", "2.4")), fused(["r1"], (reason,)))
+    said = both if is_status_first else both[::-1]
+    assert told(*said, *said, fused(["r1"]), *said) == [
+        *[("warning", same)] * is_status_first,
+        ("map", "r1 is in the team's map"),
+        *[("warning", reason)] * (not is_status_first),
+        ("map", f"no longer: {reason}"),
+        ("warning", reason),
+    ]
+
+
 def test_the_end_of_the_world_and_its_notes_are_told_once():
     end = m.End(stamp_ns=9, streams=(), notes=("a row was repaired",))
     assert told(end, end, fused([], final=True), alive(True, "recorder")) == [
