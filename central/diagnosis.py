@@ -47,6 +47,10 @@ MIRRORED_REMEDY = (
     "(counter-clockwise is positive)"
 )
 
+BETWEEN = 0.25
+"""Least distance of a moved landmark's mean from the middle of its two places to be at one of
+them, as a share of the displacement.
+"""
 SEAM_DOF = 3.0  # degrees of freedom of a seam
 
 REMEDY = "leave the robot on the ground, or restart its process where it is put down"
@@ -158,6 +162,7 @@ def diagnose(
                 evidence=each.evidence / each.dof,
                 remedy=_start_remedy(fold, each) if _is_start(each) else _REMEDIES[each.cause],
                 at_ns=each.at_ns,
+                place=_first_place(each),
             )
             for each in accepted
             if each.subject not in mirrored | undecided and not _is_bent(each, shared)
@@ -169,6 +174,37 @@ def diagnose(
     found += _wrong_minimum(fold)
     found.sort(key=lambda each: (-each.evidence, each.cause, each.robot, each.landmark or 0))
     return (*found, *noise)
+
+
+def _first_place(found: hypotheses.Hypothesis) -> tuple[float, ...]:
+    if found.cause != hypotheses.MOVED:
+        return ()
+    island = found.island
+    return tuple(island.value(island.graph.landmarks[int(found.subject)]).tolist())
+
+
+def mark_places(found: Sequence[m.Diagnosis], fold: Fold) -> tuple[m.Diagnosis, ...]:
+    """Add the place that a map has of each moved landmark: the map solves it as one place."""
+    return tuple(
+        msgspec.structs.replace(each, map_has=_held_place(each, fold))
+        if each.cause == hypotheses.MOVED
+        else each
+        for each in found
+    )
+
+
+def _held_place(found: m.Diagnosis, fold: Fold) -> m.MapPlace:
+    """Name the place of the two that the map's mean has, by its share of the displacement."""
+    island = fold.main
+    node = island.graph.landmarks.get(-1 if found.landmark is None else found.landmark)
+    if node is None or not found.place:
+        return ""
+    x, y = island.value(node).tolist()
+    (x0, y0), (dx, dy) = found.place, found.value
+    share = ((x - x0) * dx + (y - y0) * dy) / (dx * dx + dy * dy)
+    if abs(share - 0.5) < BETWEEN:
+        return "between"
+    return "first" if share < 0.5 else "second"
 
 
 def _cut_robots(cuts: Sequence[m.Diagnosis]) -> list[str]:
@@ -452,6 +488,14 @@ def contradicts(found: m.Diagnosis) -> bool:
     return is_data and found.value[0] >= MOST_SCALE
 
 
+_HELD: Mapping[m.MapPlace, str] = {
+    "": "",
+    "first": ", and the map has its first place",
+    "second": ", and the map has its second place",
+    "between": ", and the map has it between the two places",
+}
+
+
 def describe(found: m.Diagnosis) -> str:
     """Describe a cause, with figures and remedy."""
     return f"{_statement(found)}: {found.remedy}"
@@ -463,7 +507,7 @@ def _statement(found: m.Diagnosis) -> str:
     match found.cause:
         case "landmark_moved":
             by = f"({value[0]:.2f}, {value[1]:.2f}) ± {max(sigma):.2f} m"
-            return f"landmark {found.landmark} moved by {by}{when}"
+            return f"landmark {found.landmark} moved by {by}{when}{_HELD[found.map_has]}"
         case "identity_shared":
             return (
                 f"two landmarks {math.hypot(*value):.1f} m apart have the number {found.landmark}"
@@ -515,7 +559,11 @@ def to_object(found: m.Diagnosis) -> dict[str, object]:
     is_of_landmark = found.landmark is not None
     subject = {"landmark": found.landmark} if is_of_landmark else {"robot": found.robot or None}
     more: dict[str, object] = {"at_s": found.at_ns * 1e-9} if found.at_ns else {}
-    if found.place:
+    if found.cause == hypotheses.MOVED:
+        more["map_has"] = found.map_has or None
+        second = [a + d for a, d in zip(found.place, found.value, strict=False)]
+        more["places"] = [list(found.place), second] if found.place else []
+    elif found.place:
         more["place"] = list(found.place)
     if found.cause in (hypotheses.SHARED, hypotheses.CARRIED_OFF):
         more["displacement"] = list(found.value)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from teamslam.central import join_messages, localising, unnamed_landmarks
 from teamslam.central.config import CentralConfig
-from teamslam.central.diagnosis import describe, diagnose, widening
+from teamslam.central.diagnosis import describe, diagnose, mark_places, widening
 from teamslam.central.fused_map import JOINT_LANDMARKS, receivable, version_entry
 from teamslam.central.monitor import monitor_figures
 from teamslam.central.saved_maps import (
@@ -236,6 +236,7 @@ class SubmapFold:
         if final and not self.config.localise:
             fold = marginals.widen_covariances(fold, widening(self.diagnosis))
             biases = marginals.bias_estimates(fold)
+        self.diagnosis = mark_places(self.diagnosis, fold)
         joint = final and len(shown.ids) <= JOINT_LANDMARKS and bool(fold.contributions)
         ids, means, covariance = join_messages.encoded_landmarks(fold, shown.ids, joint=joint)
         store, left_out = self.store, [x for each in withdrawn.values() for x in each]

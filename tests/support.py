@@ -281,6 +281,8 @@ def map_examples() -> Iterator[m.Message]:
                 evidence=331.5,
                 remedy="remove the landmark",
                 at_ns=150 * 10**9,
+                place=(4.0, -1.5),
+                map_has="second",
             ),
         ),
         verdicts=(m.Judgement(first=place(0, 4), second=place(1, 2), same=True),),

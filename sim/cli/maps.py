@@ -72,11 +72,20 @@ def save(
 def _map_of_log(log: Path) -> "SavedMap":
     from teamslam.central.desk.verification.centre import recorded_map
     from teamslam.central.desk.verification.recorded import RerunError, index_log
+    from teamslam.central.diagnosis import describe
     from teamslam.central.saved_maps import NothingToSaveError
     from teamslam.team.recording.reader import open_log
+    from teamslam.team.wire.channels import FINAL_MAP, TEAM_FINAL
+    from teamslam.team.wire.messages import FusedMap
 
     with failing(RerunError, NothingToSaveError, at=log):
-        return recorded_map(index_log(open_log(log)), "site")
+        recorded = index_log(open_log(log))
+        saved = recorded_map(recorded, "site")
+    finals = recorded.of(FusedMap, FINAL_MAP) or recorded.of(FusedMap, TEAM_FINAL)
+    for each in finals[-1].diagnosis:
+        if each.cause == "landmark_moved":
+            click.echo(f"note: {describe(each)}")
+    return saved
 
 
 def _map_of_team(team: str | None, connect: str, keys: Path | None, patience: float) -> "SavedMap":

@@ -17,6 +17,7 @@ from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.studies.experiments.true_minimum import final_fold
 from teamslam.team.estimation.map_joining.marginals import landmark_map
 from teamslam.team.wire import messages as m
+from teamslam.team.wire.arrays import floats, ids
 from teamslam.team.wire.bus import Sample
 from tests.commands import run
 from tests.scenarios import final_only, scenario_in, with_front_ends
@@ -48,13 +49,22 @@ def test_a_right_map_has_no_cause_of_misfit(tmp_path):
 @pytest.mark.parametrize("by", [(0.5, 0.0), (1.4, 1.4)], ids=["half a metre", "two metres"])
 def test_a_landmark_that_was_moved_is_named_with_its_motion(tmp_path, by):
     of = scenario(replace(WORLD, moved=(MovedLandmark(7, by, 60.0),)), tmp_path)
-    first, *_ = diagnosed(of)
+    fused = final_map(team_samples(of))
+    first, *_ = fused.diagnosis
     assert (first.cause, first.landmark) == ("landmark_moved", 7)
     for value, sigma, true in zip(first.value, first.sigma, by, strict=True):
         assert value == pytest.approx(true, abs=4.0 * sigma)
         assert sigma < 0.1
     assert first.at_ns * 1e-9 == pytest.approx(60.0, abs=10.0)
     assert describe(first).startswith("landmark 7 moved by (")
+    places = [np.array(first.place), np.add(first.place, first.value)]
+    means = floats(fused.means, "means").reshape(-1, 2)
+    mean = means[ids(fused.ids, "ids").tolist().index(7)]
+    away = [float(np.linalg.norm(mean - each)) for each in places]
+    assert min(away) < 0.25 * float(np.linalg.norm(first.value))
+    assert first.map_has == ("first" if away[0] < away[1] else "second")
+    assert f"the map has its {first.map_has} place" in describe(first)
+    assert to_object(first)["map_has"] == first.map_has
 
 
 def test_one_number_of_two_landmarks_is_named(tmp_path):
@@ -216,6 +226,10 @@ def test_the_object_of_a_cause_has_a_number_or_the_two_of_a_motion():
     )
     scale = m.Diagnosis(cause="noise_underestimated", value=(4.0,), sigma=(0.5,))
     assert to_object(moved).items() >= {"landmark": 7, "value": [2.0, 0.1], "at_s": 1.0}.items()
+    held = msgspec.structs.replace(moved, place=(1.0, -0.5), map_has="second")
+    assert "and the map has its second place" in describe(held)
+    assert to_object(held)["map_has"] == "second"
+    np.testing.assert_allclose(to_object(held)["places"], [[1.0, -0.5], [3.0, -0.4]])
     assert to_object(scale).items() >= {"robot": None, "value": 4.0, "sigma": 0.5}.items()
 
 

@@ -133,6 +133,8 @@ Cause = Literal[
     "noise_overestimated",
 ]
 
+MapPlace = Literal["", "first", "second", "between"]
+
 
 class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     """A cause of misfit: of a robot, of a landmark, or of the team (neither).
@@ -141,7 +143,8 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     robot that was carried off, with at_ns 0 of its true from its initial pose; else one number or
     none. evidence: removed cost per degree of
     freedom, or the log-likelihood ratio of a view that changed at once. at_ns: team time of the
-    change; 0: none. place: (x, y) [m] of it, if known.
+    change; 0: none. place: (x, y) [m] of it, if known; of a moved landmark its first place.
+    map_has: the place of a moved landmark in this map, "" if it is not evaluated.
     """
 
     cause: Cause
@@ -153,6 +156,7 @@ class Diagnosis(msgspec.Struct, frozen=True, kw_only=True, array_like=True):
     remedy: Text = ""
     at_ns: StampNs = 0
     place: tuple[Real, ...] = ()
+    map_has: MapPlace = ""
 
 
 class FusedMap(Message, frozen=True, kw_only=True, tag="fused_map/1"):
