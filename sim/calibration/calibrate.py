@@ -7,6 +7,7 @@ scales, drag, veer and clocks are calibrated, and the join trusts odometry less.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from math import hypot
 
 import msgspec
@@ -15,7 +16,11 @@ import numpy as np
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.evaluation.errors import TRUTH_GAP_NS, Path
 from teamslam.sim.calibration import claims, clocks, motion, sensor
-from teamslam.sim.calibration.consistency import central_figures, factor_by_cost
+from teamslam.sim.calibration.consistency import (
+    central_figures,
+    factor_by_cost,
+    without_excess,
+)
 from teamslam.sim.calibration.data import (
     LEAST_SPANS,
     Reference,
@@ -31,6 +36,7 @@ from teamslam.sim.calibration.own import marker_spread, own_constants
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import WorldStreams
 from teamslam.team.config import MotionModel, MotionNoise
+from teamslam.team.estimation.hybrid_slam.window import NOTHING, Innovation
 
 JOINED_GAP_NS = 2_000_000_000
 SCALES = ("forward_scale", "turn_drag", "yaw_scale", "veer", "slow_scale")
@@ -218,13 +224,17 @@ def _calibrate_by_map(
     of_central = central_figures([team.fold for team in teams], scenario, (), progress)
     if not of_central and len(teams) == 1:
         of_central = _fit_factor_by_cost(teams[0], scenario.central, progress)
+    innovation = reduce(Innovation.plus, (team.innovation for team in teams), NOTHING)
+    least = sum(team.least for team in teams)
+    sensor_model = scenario.robots[0].sensor
+    of_central, excess = without_excess(of_central, innovation, least, sensor_model)
     note = (
         "no true paths and landmarks: the sensor's figures and the densities of noise stay as they "
         "are"
     )
     if any(each.seen.covariances is not None for each in data):
         note += "; so do the factors of covariances that come with measurements, and the mount"
-    findings = (note, *notes, *clocks.clock_notes(of_clocks), *_alarms(figures, scenario))
+    findings = (note, *excess, *notes, *clocks.clock_notes(of_clocks), *_alarms(figures, scenario))
     return Calibration(
         figures, (), False, findings, of_central, clocks=_clock_figures(of_clocks, scenario)
     )

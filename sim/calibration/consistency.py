@@ -17,10 +17,13 @@ from scipy.optimize import brentq
 
 from teamslam.central.config import CentralConfig
 from teamslam.central.desk.evaluation.errors import map_errors, rigid_alignment, transform_points
+from teamslam.central.monitor import SCALE_WARN
 from teamslam.central.tick_fold import join_settings
 from teamslam.sim.calibration.figures import Figure, nest_figures
 from teamslam.sim.scenarios.scenario import Scenario
+from teamslam.team.config import Sensor
 from teamslam.team.estimation.contribution import InitialPoseFactor, Stream
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.map_joining.gauss_newton import (
     Island,
     JoinSettings,
@@ -38,6 +41,8 @@ LEAST_ROBOTS = 3  # least number of robots in all worlds together
 FARTHEST_M = 1.0  # largest distance of a measured landmark from its place
 SETTLED = 0.02  # relative factor change that ends the iteration
 MOST_ROUNDS = 8
+EXCESSIVE = 1.0 / SCALE_WARN  # NIS over its least expected value that shows too large sigmas
+LASTING = 2.0  # standard deviations of ln `covariance_factor` from 0 that show lasting errors
 APART = 2**40  # offset of the single robot's landmark numbers, above all others
 
 
@@ -172,6 +177,39 @@ def _normal_scale(teams: Sequence[Fold], central: CentralConfig) -> Figure | Non
     value = float(np.exp(np.mean(scales)))
     spread = float(np.std(scales, ddof=1)) if len(scales) > 1 else float(sigmas[0])
     return Figure("normal_scale", value, value * spread / np.sqrt(len(scales)), "")
+
+
+def without_excess(
+    figures: Sequence[Figure], innovation: Innovation, least: float, sensor: Sensor
+) -> tuple[tuple[Figure, ...], tuple[str, ...]]:
+    """Figures whose `normal_scale` hides no sigmas that NIS shows too large, with a note on these.
+
+    Right sigmas have a NIS of at least `least`. A smaller one comes from too large sigmas, or from
+    unstated errors that outlast windows: then maps of single robots disagree by more than the
+    submaps claim, `covariance_factor` is above 1 beyond doubt, and nothing is changed.
+    """
+    by_name = {figure.name: figure for figure in figures}
+    scale, factor = by_name.get("normal_scale"), by_name.get("covariance_factor")
+    nis = innovation.per_dof
+    if scale is None or factor is None or nis is None or least <= 0.0:
+        return tuple(figures), ()
+    excess = innovation.squared / least
+    lasting = np.log(factor.value) > LASTING * factor.sigma / factor.value
+    if not 0.0 < excess < EXCESSIVE or lasting:
+        return tuple(figures), ()
+    by_name["normal_scale"] = replace(scale, value=scale.value / excess, sigma=scale.sigma / excess)
+    times = float(np.sqrt(excess))
+    sigmas = ", ".join(
+        f"{name} = {times * value:.2g} for {value:g}"
+        for name in ("range_sigma", "range_sigma_per_m", "bearing_sigma")
+        if (value := float(getattr(sensor, name)))
+    )
+    note = (
+        f"NIS {nis:.2f} per degree of freedom: the stated sigmas are too large by "
+        f"{1.0 / times:.2g}: multiply those of sensor and odometry by {times:.2g} "
+        f"({sigmas}); normal_scale leaves that share out"
+    )
+    return tuple(by_name.values()), (note,)
 
 
 def disagreements(fold: Fold, settings: JoinSettings) -> list[_Disagreement]:

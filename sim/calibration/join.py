@@ -14,10 +14,15 @@ from teamslam.sim.calibration.figures import CalibrationError
 from teamslam.sim.scenarios.scenario import Scenario
 from teamslam.sim.world.streams import RobotStream, WorldStreams
 from teamslam.team import translate
-from teamslam.team.config import RobotConfig
+from teamslam.team.config import RobotConfig, Sensor
 from teamslam.team.estimation.contribution import Contribution, InitialPoseFactor
 from teamslam.team.estimation.hybrid_slam.pipeline import HybridSlam
-from teamslam.team.estimation.hybrid_slam.window import ClosedWindow, Window
+from teamslam.team.estimation.hybrid_slam.window import (
+    NOTHING,
+    ClosedWindow,
+    Innovation,
+    Window,
+)
 from teamslam.team.estimation.map_joining.joining import (
     EMPTY_FOLD,
     Fold,
@@ -41,12 +46,18 @@ class _Track:
 
 @dataclass(frozen=True)
 class JoinedTeam:
-    """Landmarks and paths in the joined map's frame."""
+    """Landmarks and paths in the joined map's frame.
+
+    innovation: NIS of all windows. least: its least expected value under the stated models: white
+    errors count in full, and those that last a window can vanish from innovations.
+    """
 
     landmarks: Mapping[int, Float[np.ndarray, "2"]]
     paths: Mapping[str, Path]
     fold: Fold
     contributions: Sequence[Contribution] = ()
+    innovation: Innovation = NOTHING
+    least: float = 0.0
 
 
 def join_team(
@@ -86,7 +97,18 @@ def join_team(
         at = graph.offset[list(nodes)]
         ends = state[at[:, np.newaxis] + np.arange(3)]
         paths[robot] = _bend_to_ends(tracks[robot], ends)
-    return JoinedTeam(landmarks, paths, fold, contributions)
+    innovation, least = NOTHING, 0.0
+    for robot, windows in tracks.items():
+        sensor = config_of(robot, scenario).sensor
+        for t in windows:
+            innovation = innovation.plus(t.closed.innovation)
+            least += least_nis(t.closed.innovation, sensor)
+    return JoinedTeam(landmarks, paths, fold, contributions, innovation, least)
+
+
+def least_nis(innovation: Innovation, sensor: Sensor) -> float:
+    """Least expected NIS: ranges and bearings by their white shares."""
+    return 0.5 * (sensor.range_white + sensor.bearing_white) * innovation.dof
 
 
 def fold_of(

@@ -7,20 +7,32 @@ import pytest
 from teamslam.central.config import CentralConfig
 from teamslam.central.tick_fold import join_settings
 from teamslam.sim.calibration.consistency import (
+    EXCESSIVE,
     central_figures,
     covariance_factor,
     disagreements,
     factor_by_cost,
     landmark_sigma,
+    without_excess,
 )
 from teamslam.sim.calibration.detections import claim_notes, detection_figures, windows_of
 from teamslam.sim.calibration.figures import Figure
-from teamslam.sim.calibration.join import fold_of
-from teamslam.sim.scenarios.scenario import load, with_options
+from teamslam.sim.calibration.join import fold_of, join_team
+from teamslam.sim.scenarios.scenario import Scenario, load, with_options
 from teamslam.sim.scenarios.source import streams_of
+from teamslam.sim.world.config import SimulatedWorld
+from teamslam.sim.world.simulator import simulate
 from teamslam.sim.world.streams import NO_LABEL
 from teamslam.team.association import AssociationProfile
-from teamslam.team.config import AssociationSettings
+from teamslam.team.config import (
+    AssociationSettings,
+    FrontEnd,
+    MotionModel,
+    MotionNoise,
+    RobotConfig,
+    Sensor,
+)
+from teamslam.team.estimation.hybrid_slam.window import Innovation
 from teamslam.team.estimation.map_joining.joining import Fold, JoinSettings, solve_fold
 from tests.estimation.association.unnamed_worlds import circle, drive
 from tests.estimation.sighting_world import joined_with
@@ -70,6 +82,37 @@ def test_figures_of_the_team_are_named_as_the_centres_fields():
     assert found[-1].value == pytest.approx(1.0, abs=0.3)
 
 
+def central_of(folds):
+    return central_figures(folds, load("thesis"), (), lambda _: None)
+
+
+def test_sigmas_that_nis_shows_too_large_stay_in_sight_of_the_monitor():
+    figures = central_of(folds_of(range(12), 2.25))
+    assert figures[-1].value == pytest.approx(1.0 / 2.25, rel=0.2)
+    sensor = Sensor(range_sigma=0.09, bearing_sigma=0.03)
+    found, notes = without_excess(figures, Innovation(4000.0 / 2.25, 4000), 4000.0, sensor)
+    assert [each.name for each in found] == [each.name for each in figures]
+    assert found[-1].value == pytest.approx(2.25 * figures[-1].value)
+    assert notes[0].startswith(
+        "NIS 0.44 per degree of freedom: the stated sigmas are too large by 1.5: multiply those "
+        "of sensor and odometry by 0.67 (range_sigma = 0.06 for 0.09, bearing_sigma = 0.02 "
+    )
+
+
+@pytest.mark.parametrize(
+    ("nis", "least", "factor"),
+    [
+        (1.0, 1.0, Figure("covariance_factor", 1.1, 0.5, "")),
+        (0.56, 0.62, Figure("covariance_factor", 1.1, 0.5, "")),  # white shares below 1
+        (0.44, 1.0, Figure("covariance_factor", 2.6, 0.9, "")),  # robots disagree
+    ],
+)
+def test_a_normal_scale_of_errors_that_outlast_windows_stays(nis, least, factor):
+    figures = (factor, Figure("normal_scale", 0.28, 0.01, ""))
+    innovation = Innovation(4000 * nis, 4000)
+    assert without_excess(figures, innovation, 4000 * least, Sensor()) == (figures, ())
+
+
 def test_how_far_all_robots_see_landmarks_from_their_survey_is_learnt_by_the_truth():
     folds, config = folds_of(range(30))[:12], CentralConfig()
     rng = np.random.default_rng(5)
@@ -94,6 +137,22 @@ def test_where_the_covariances_are_wider_than_the_errors_landmarks_have_no_sigma
     ]
     found = landmark_sigma(list(zip(folds, true, strict=True)), CentralConfig())
     assert found.value == 0.0
+
+
+def test_lasting_errors_lower_nis_by_no_more_than_their_share():
+    motion = MotionModel(
+        forward=MotionNoise(per_m=0.01), turn=MotionNoise(per_m=0.02, per_rad=0.02)
+    )
+    sensor = Sensor(range_sigma=0.05, bearing_sigma=0.02, range_white=0.3, bearing_white=0.3)
+    robot = RobotConfig("r1", motion, sensor, FrontEnd(particles=50, window_s=10.0))
+    place = SimulatedWorld(
+        steps=120, size_m=12.0, landmark_count=15, visible_from_m=0.5, visible_to_m=6.0
+    )
+    told = Scenario(name="one", team="one", world=place, robots=(robot,))
+    team_of_one = join_team(simulate(place, told.robots, 11), told)
+    nis = team_of_one.innovation
+    assert team_of_one.least == pytest.approx(0.3 * nis.dof)
+    assert team_of_one.least < nis.squared < EXCESSIVE * nis.dof
 
 
 REACH_M = 12.0
