@@ -2,6 +2,8 @@
 
 import math
 import re
+from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,11 @@ def read_map(path: Path) -> m.SavedMap:
     """Read and check the file of a saved map; raises SavedMapError."""
     try:
         return decoded(path.read_bytes(), m.SavedMap)
+    except IsADirectoryError:
+        raise SavedMapError(
+            f"{path}: a folder is no saved map; if it is a run's, save its map by "
+            f"`teamslam map save {path} -o site.map`"
+        ) from None
     except OSError as error:
         raise SavedMapError(f"{path}: cannot be read: {error.strerror}") from None
     except WireError as error:
@@ -38,6 +45,30 @@ def read_map(path: Path) -> m.SavedMap:
             "truncated": "it is cut off: copy or save it again",
         }.get(error.reason, "it is damaged or no saved map: save it again")
         raise SavedMapError(f"{path}: {remedy} ({error})") from None
+
+
+def find_overlap(maps: Mapping[str, m.SavedMap]) -> str | None:
+    """Describe the first two maps, by file, that have measurements in common; None without.
+
+    A chain of days contains all sets of the earlier days; two maps may also share only some.
+    """
+    for (one, a), (other, b) in combinations(maps.items(), 2):
+        first, second = set(a.sets), set(b.sets)
+        if not first & second:
+            continue
+        if first == second:
+            return f"{one} and {other} are maps of the same measurements: load one of them"
+        if first < second or second < first:
+            part, whole = (one, other) if first < second else (other, one)
+            return (
+                f"{whole} contains the measurements of {part}, which would count twice: load "
+                f"{whole} only"
+            )
+        return (
+            f"{one} and {other} have measurements in common, which would count twice: load one of "
+            "them"
+        )
+    return None
 
 
 def write_map(path: Path, saved: m.SavedMap) -> None:

@@ -126,6 +126,7 @@ def launch(
     )
     if localise:
         opt.check_localises(map_, resolved)
+    opt.check_joins(resolved, opt.saved_maps(map_))
     if pieces is not None:
         opt.check_pieces(resolved)
     resolved, missing, streams = _checked_world(resolved)
@@ -142,7 +143,6 @@ def launch(
     log.parent.mkdir(parents=True, exist_ok=True)
     _keep_earlier(log)
     folder.mkdir(parents=True, exist_ok=True)
-    opt.check_joins(resolved, opt.saved_maps(map_))
     from teamslam.sim.launch.launch import Plan
 
     plan = Plan(

@@ -276,10 +276,11 @@ def scenario_of(name: str) -> Scenario:
 
 
 def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
-    """Read saved maps of different names."""
+    """Read saved maps of different names, without measurements in common."""
     if not paths:
         return []
-    from teamslam.team.saved_map import SavedMapError, read_map  # a log's reader comes with it
+    # A log's reader comes with it.
+    from teamslam.team.saved_map import SavedMapError, find_overlap, read_map
 
     with refusing(SavedMapError):
         found = [read_map(path) for path in paths]
@@ -287,6 +288,9 @@ def saved_maps(paths: "Sequence[Path] | None") -> "list[SavedMap]":
     twice = next((a for a, b in pairwise(names) if a == b), None)
     if twice is not None:
         refuse(f"two maps have the name {twice}: save one of them by another --name")
+    overlap = find_overlap(dict(zip(map(str, paths), found, strict=True)))
+    if overlap is not None:
+        refuse(f"--map: {overlap}")
     return found
 
 

@@ -401,6 +401,31 @@ def test_the_file_is_read_as_written_and_a_wrong_one_is_named_with_the_remedy(tm
         assert str(path) in str(caught.value)
     with pytest.raises(SavedMapError, match="cannot be read"):
         read_map(tmp_path / "none.map")
+    with pytest.raises(SavedMapError, match=f"teamslam map save {tmp_path} -o site.map"):
+        read_map(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("days", "words"),
+    [
+        (("1", "12"), "second.map contains the measurements of {first}"),
+        (("1", "1"), "maps of the same measurements: load one of them"),
+        (("12", "13"), "have measurements in common"),
+    ],
+)
+def test_maps_with_measurements_in_common_are_refused_before_a_run(tmp_path, days, words):
+    first, second = tmp_path / "first.map", tmp_path / "second.map"
+    for file, of in zip((first, second), days, strict=True):
+        sets = tuple(day.encode() * 8 for day in of)
+        write_map(file, example(m.SavedMap, name=file.stem, sets=sets))
+    for command in (("rerun", tmp_path), ("launch", "thesis-b", "-o", tmp_path / "run")):
+        for files in ((first, second), (second, first)):
+            maps = [word for file in files for word in ("--map", file)]
+            refusal = " ".join(output_of(*command, *maps, status=2).split())
+            assert words.format(first=first) in refusal
+            assert str(first) in refusal
+            assert str(second) in refusal
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
