@@ -18,7 +18,7 @@ from teamslam.central.desk.evaluation.results import Evaluation, RobotResult, fi
 from teamslam.central.desk.names import OUTSIDE, in_order
 from teamslam.central.desk.pictures.run import in_the_maps_frame, new_figure, set_up_map
 from teamslam.central.desk.pictures.style import save
-from teamslam.central.desk.report.tables import DEGREES, Column, cells, comparable
+from teamslam.central.desk.report.tables import DEGREES, NO_FIGURE, Column, cells, comparable
 from teamslam.team.estimation.dense import diagonal_blocks
 
 Row = tuple[str, tuple[str, ...]]
@@ -74,6 +74,11 @@ def compare_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
         robots = ((run, run.robots.get(name)) for run in every)
         rows += _rows(f"{name}: ", _ROBOT, [of and comparable(run, of) for run, of in robots])
     return rows
+
+
+def filled_rows(runs: Mapping[str, Evaluation]) -> list[Row]:
+    """Rows of `compare_rows` that have a figure of at least one run."""
+    return [row for row in compare_rows(runs) if any(cell != NO_FIGURE for cell in row[1])]
 
 
 def _rows(before: str, columns: Sequence[Column], of: Sequence[object]) -> list[Row]:

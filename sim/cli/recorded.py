@@ -210,7 +210,7 @@ def compare(
     from rich.table import Table
     from rich.text import Text
 
-    from teamslam.central.desk.compare import compare_figures, compare_picture, compare_rows
+    from teamslam.central.desk.compare import compare_figures, compare_picture, filled_rows
     from teamslam.central.desk.evaluation.evaluation import evaluate
 
     if len(runs) < FEWEST:
@@ -227,7 +227,7 @@ def compare(
     table.add_column("", no_wrap=True)
     for name in evaluated:
         table.add_column(Text(name), justify="right")
-    for figure, cells in compare_rows(evaluated):
+    for figure, cells in filled_rows(evaluated):
         table.add_row(Text(figure), *(Text(cell) for cell in cells))
     print_table(table)
     if output is not None and compare_picture(evaluated, output):

@@ -14,8 +14,10 @@ from teamslam.sim.cli import options as opt
 from teamslam.sim.cli.commands import Group, argument, fail, failing, option, output_option, refuse
 from teamslam.sim.cli.results import (
     Steps,
+    print_changes,
     print_nis,
     print_notes,
+    print_placements,
     print_table,
     print_written,
     read_run,
@@ -166,8 +168,8 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     from rich.text import Text
 
     from teamslam.central.desk.compare import (
-        compare_rows,
         draw_maps,
+        filled_rows,
         largest_move_m,
         same_final_map,
     )
@@ -195,11 +197,14 @@ def _compare(path: Path, changes: "Changes", json_file: Path | None, output: Pat
     before = "unchanged" if isinstance(log, DataSetRun) else "recorded"
     runs = {"computed": changed} if plain else {before: recorded, "recomputed": changed}
     table = Table("", *runs)
-    for figure, cells in compare_rows(runs):
+    for figure, cells in filled_rows(runs):
         table.add_row(Text(figure), *map(Text, cells))
     print_table(table)
     print_notes(changed.warnings, dict.fromkeys((*recorded.notes, *changed.notes)))
     print_nis(reading.history)
+    print_changes(changed)
+    if changes.localise:
+        print_placements(computed, reading.history.start_ns)
     same, move_m = same_final_map(recorded, changed), largest_move_m(recorded, changed)
     moved = "" if move_m is None else f", landmarks up to {move_m:.3g} m apart"
     verdict = "the same bytes" if same else f"another one{moved}"

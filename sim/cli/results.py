@@ -4,6 +4,7 @@ import shlex
 import sys
 import time
 from collections.abc import Iterable
+from math import degrees
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from teamslam.central.desk.evaluation.results import Evaluation
     from teamslam.central.desk.report.run import Reading, Run
     from teamslam.team.recording.reader import Log
+    from teamslam.team.wire.bus import Sample
 
 PATIENCE_S = 3.0  # time [s] between lines and before the first, so short work prints none
 
@@ -97,6 +99,36 @@ def print_nis(history: "History") -> None:
     per_dof = {name: of.per_dof for name, of in history.innovations.items()}
     if parts := [f"{name} {value:.2f}" for name, value in per_dof.items() if value is not None]:
         click.echo(f"NIS per dof: {', '.join(parts)}")
+
+
+def print_changes(evaluation: "Evaluation") -> None:
+    """Print the landmarks that have changed since the saved maps, if any was loaded."""
+    from teamslam.central.desk.report.tables import describe_changes
+
+    if evaluation.map is not None and evaluation.map.changes:
+        click.echo(f"changes: {describe_changes(evaluation.map.changes)}")
+
+
+def print_placements(samples: "Iterable[Sample]", start_ns: int) -> None:
+    """Print when and where each robot was placed first in the saved map."""
+    from teamslam.central.desk.names import in_order
+    from teamslam.team.config import MAP
+    from teamslam.team.wire import channels as ch, messages as m
+    from teamslam.team.wire.arrays import floats
+    from teamslam.team.wire.bus import open_valid
+
+    first: dict[str, m.PoseEstimate] = {}
+    poses = (sample for sample in samples if ch.row_of(sample.key) is ch.TEAM_POSE)
+    for _, _, pose in open_valid(poses):
+        if isinstance(pose, m.PoseEstimate) and pose.frame.startswith(MAP):
+            first.setdefault(pose.robot, pose)
+    for robot in in_order(first):
+        pose = first[robot]
+        x, y, heading = floats(pose.pose, "pose").tolist()
+        click.echo(
+            f"{robot}: placed first after {(pose.stamp_ns - start_ns) * 1e-9:.1f} s at "
+            f"x {x:.2f} m, y {y:.2f} m, heading {degrees(heading):.0f}°"
+        )
 
 
 def print_written(paths: Iterable[Path]) -> None:

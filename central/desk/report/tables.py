@@ -31,6 +31,7 @@ LEFT = ("robot", "disposition", "channel", "kind", "landmarks", "reason")
 CHANGES = ("moved", "gone", "new", "unchanged")  # states of landmarks against saved maps, as listed
 LISTED = 5  # most landmarks of one state in a line of text, and most robots named below a table
 DECISIONS = 200  # most decisions in the table; report.json has all
+NO_FIGURE = "–"
 Rows = Sequence[tuple[str, str]]
 
 
@@ -55,7 +56,7 @@ class Column(NamedTuple):
 def format_figure(value: float | str | None, form: str, unit: str = "", factor: float = 1) -> str:
     """Format a number with its unit; a dash for None."""
     if value is None or isinstance(value, str):
-        return "–" if value is None else value
+        return NO_FIGURE if value is None else value
     return f"{factor * value:{form}}{unit}"
 
 
@@ -135,7 +136,7 @@ def team_rows(evaluation: Evaluation) -> Rows:
     if evaluation.gps_median_m is not None:
         rows.append(("distance from GPS", f"{evaluation.gps_median_m:.2f} m, median of the paths"))
     rows += [] if evaluation.association is None else _association_rows(evaluation.association)
-    rows += [("changes", _describe_changes(fused.changes))] if fused.changes else []
+    rows += [("changes", describe_changes(fused.changes))] if fused.changes else []
     rows += [("joined", short(words)) for words in fused.joined]
     rows += [("cause of misfit", describe(each)) for each in evaluation.diagnosis]
     joins = evaluation.scenario is not None and evaluation.scenario.fusion == "join"
@@ -202,7 +203,7 @@ def _state_rows(evaluation: Evaluation) -> Rows:
     return rows + [(of.state, f"{name}: {of.why}") for name, of in apart]
 
 
-def _describe_changes(changes: Sequence[m.LandmarkChange]) -> str:
+def describe_changes(changes: Sequence[m.LandmarkChange]) -> str:
     """Summarise changes since the saved maps, such as `1 moved (7: +0.50, -0.25 ± 0.02 m)`."""
     parts = []
     for state in CHANGES:

@@ -9,7 +9,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 from PIL import Image
 
-from teamslam.central.desk.compare import compare_rows, draw_maps
+from teamslam.central.desk.compare import compare_rows, draw_maps, filled_rows
 from teamslam.central.desk.drawing import ELLIPSE_SCALE, curve_through, ellipses
 from teamslam.central.desk.evaluation.evaluation import evaluate
 from teamslam.central.desk.pictures import film
@@ -171,6 +171,8 @@ def test_errors_in_an_arbitrary_frame_are_neither_printed_nor_drawn(tmp_path, dr
     texts = [" ".join(labels_of(figure)) for figure in drawn]
     assert ["the frame's own error" in each for each in texts] == [True, False]
     assert compare_rows({"a": run, "b": run})[3] == ("landmark RMSE [m]", ("–", "–"))
+    assert "landmark RMSE [m]" not in dict(filled_rows({"a": run, "b": run}))
+    assert dict(filled_rows({"a": run, "b": known}))["landmark RMSE [m]"][0] == "–"
 
 
 def test_compared_maps_in_an_arbitrary_frame_lie_over_the_aligned_truth(tmp_path, drawn):

@@ -2,6 +2,7 @@ import os
 import random
 import signal
 import struct
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -12,6 +13,7 @@ from teamslam.central.desk.verification import verification
 from teamslam.central.desk.verification.recorded import RerunError
 from teamslam.central.desk.verification.verification import Verification, verify
 from teamslam.sim.cli.rerun import app
+from teamslam.sim.cli.results import print_changes, print_placements
 from teamslam.sim.in_memory.team import final_map
 from teamslam.sim.recorded.changed_run import Changes, changed_run
 from teamslam.sim.scenarios.document import ScenarioError
@@ -24,6 +26,7 @@ from teamslam.team.wire.bus import Sample
 from teamslam.team.wire.codec import encoded
 from tests import build
 from tests.sim.reruns import changed, messages, said, team_samples, thesis, written
+from tests.support import example
 from tests.teams import LOCALISERS, Team, config, stream, world_of
 
 STEPS = 60
@@ -362,3 +365,24 @@ def test_a_log_that_lacks_a_measurement_runs_under_no_other_conditions(samples, 
         RerunError, match=f"measurement {lost.number} of r1, incarnation 1 is not in the log"
     ):
         changed_run(written(tmp_path / "log.mcap", cut), Changes())
+
+
+def test_changes_and_the_first_place_of_each_localised_robot_are_printed(capsys):
+    changes = (m.LandmarkChange(landmark=7, state="gone"),)
+    print_changes(SimpleNamespace(map=SimpleNamespace(changes=changes)))
+    poses = [
+        example(
+            m.PoseEstimate,
+            stamp_ns=second * 10**9,
+            robot="r1",
+            frame=frame,
+            pose=from_floats([second, 2.0, 0.0]),
+        )
+        for second, frame in ((1, "r1/0"), (3, "map-site/0"), (4, "map-site/0"))
+    ]
+    samples = [Sample(ch.TEAM_POSE.key("r1"), encoded(p), p.stamp_ns, 0, 0) for p in poses]
+    print_placements(samples, 10**9)
+    assert capsys.readouterr().out.splitlines() == [
+        "changes: 1 gone (7)",
+        "r1: placed first after 2.0 s at x 3.00 m, y 2.00 m, heading 0°",
+    ]
