@@ -14,7 +14,7 @@ from teamslam.sim.datasets.csv_table import (
     read_table,
 )
 from teamslam.sim.datasets.detections_table import detections_of, merge_detections
-from teamslam.sim.datasets.folder_files import name_table, open_folder, unused_files
+from teamslam.sim.datasets.folder_files import DETECTIONS, name_table, open_folder, unused_files
 from teamslam.sim.datasets.folder_odometry import intervals_of
 from teamslam.sim.datasets.tables import DatasetError, File
 from teamslam.sim.world.config import FolderWorld
@@ -120,7 +120,11 @@ def stream_of(
     driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
     notes += more
-    if unnamed is not None:
+    if unnamed is not None and len(unnamed.stamps_ns):
+        table = CsvTable(f"{robot}/{DETECTIONS}", {}, [])
+        problem = rows.clock_problem(table, unnamed.stamps_ns, driven)
+        if problem is not None:
+            raise DatasetError(f"{table.name}, column t_s: {problem}")
         unnamed = unnamed.within(*driven)
     if not len(seen.stamps_ns) and unnamed is None:
         notes.append("no observations: only its odometry is given")

@@ -32,6 +32,14 @@ NOT_A_COVARIANCE = (
 EARLY = "more than 2 s before its first odometry, where its motion is not known"
 LATE = "after its last odometry, where its motion is not known"
 EARLY_NS = 2_000_000_000  # longest time by which measurements may precede odometry, at standstill
+LEAST_OUTSIDE, MOST_OUTSIDE = 5, 0.9
+"""Number and share of a table's rows that may be outside the odometry's times."""
+UNITS = (
+    ("milliseconds", "1e-3", 10**3),
+    ("microseconds", "1e-6", 10**6),
+    ("nanoseconds", "1e-9", 10**9),
+)
+UNEQUAL = 2.0  # greatest ratio of two spans of one recording in one unit
 FAR_M = 1_000.0  # median range [m] above which metres are improbable
 LEAST_BELOW, MOST_BELOW = 2, 0.1  # number and share of ranges that may be below 0 by chance
 MOST_RAD = 2.0 * np.pi + 1e-3  # largest bearing that can be in radians
@@ -151,17 +159,57 @@ def measurements_of(
     return found, empty_ns, rows.notes
 
 
-def _check_clock(rows: Rows, driven: tuple[int, int]) -> None:
-    first_ns, last_ns = int(rows.stamps_ns[0]), int(rows.stamps_ns[-1])
-    begin_ns, end_ns = driven
-    if first_ns > end_ns or last_ns < begin_ns - EARLY_NS:
-        raise rows.table.error(
-            0,
-            "t_s",
-            f"its times, {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, are not those of the "
-            f"odometry, {begin_ns * 1e-9:.3f} to {end_ns * 1e-9:.3f} s; all tables of a team have "
-            "one clock: put them on it by a map of columns (offset, scale)",
-        )
+def _check_clock(rows: Rows, driven: tuple[int, int], *, may_outlast: bool = False) -> None:
+    problem = clock_problem(rows.table, rows.stamps_ns, driven, may_outlast=may_outlast)
+    if problem is not None:
+        row = int(_are_outside(rows.stamps_ns, driven).argmax())
+        raise rows.table.error(row, "t_s", problem)
+
+
+def clock_problem(
+    table: CsvTable,
+    stamps_ns: Int64[np.ndarray, " R"],
+    driven: tuple[int, int],
+    *,
+    may_outlast: bool = False,
+) -> str | None:
+    """Describe ordered stamps of another clock or unit than the odometry's, or None.
+
+    No stamp, or fewer than one in ten, is at a time of the odometry. may_outlast: the latter is a
+    problem only if the spans differ as units do.
+    """
+    (first_ns, last_ns), (begin_ns, end_ns) = (int(stamps_ns[0]), int(stamps_ns[-1])), driven
+    count = int(np.count_nonzero(_are_outside(stamps_ns, driven)))
+    unit = unit_of((last_ns - first_ns) / max(end_ns - begin_ns, 1))
+    is_apart = first_ns > end_ns or last_ns < begin_ns - EARLY_NS
+    is_mostly = count > max(LEAST_OUTSIDE, MOST_OUTSIDE * len(stamps_ns))
+    if not is_apart and (not is_mostly or (may_outlast and unit is None)):
+        return None
+    remedy = "put them on it by a map of columns (offset, scale)"
+    if unit is not None:
+        name, scale, times = unit
+        remedy = f"its span is about {times:,} times as long, as times in {name} are; "
+        remedy += table.conversion("t_s", name, scale)
+    share = "" if is_apart else f", {count} of {len(stamps_ns)} rows outside"
+    return (
+        f"its times, {first_ns * 1e-9:.3f} to {last_ns * 1e-9:.3f} s, are not those of the "
+        f"odometry, {begin_ns * 1e-9:.3f} to {end_ns * 1e-9:.3f} s{share}; all tables of a team "
+        f"have one clock: {remedy}"
+    )
+
+
+def _are_outside(
+    stamps_ns: Int64[np.ndarray, " R"], driven: tuple[int, int]
+) -> Bool[np.ndarray, " R"]:
+    return (stamps_ns > driven[1]) | (stamps_ns < driven[0] - EARLY_NS)
+
+
+def unit_of(ratio: float) -> tuple[str, str, int] | None:
+    """Name, scale and number per second of the unit that makes a span this many times as long."""
+    for name, scale, times in UNITS:
+        if times / UNEQUAL < ratio < times * UNEQUAL:
+            return name, scale, times
+    return None
 
 
 def _scans(rows: Rows, ids: UInt32[np.ndarray, " R"], *, claims: bool) -> Scans:
@@ -266,7 +314,7 @@ def truth_of(
         return np.empty(0, np.int64), np.zeros((0, 3)), []
     rows = Rows(table, "true pose")
     if driven is not None:
-        _check_clock(rows, driven)
+        _check_clock(rows, driven, may_outlast=True)
     poses = rows.table.numbers(*POSES)
     if _are_degrees(poses):
         row = int((np.abs(poses[:, 2]) > MOST_RAD).argmax())

@@ -283,6 +283,46 @@ def test_damage_names_file_line_column_and_remedy(tmp_path, table, text, words):
     assert words in str(error.value)
 
 
+def rows_in(unit: int, header: str, row: str, seconds: int) -> str:
+    return header + "".join(f"{t * unit},{row}\n" for t in range(seconds))
+
+
+@pytest.mark.parametrize(
+    ("table", "header", "row"),
+    [
+        ("observations", SEEN_HEAD, "7,2.5,0.5"),
+        ("detections", "t_s,range_m,bearing_rad\n", "2.5,0.5"),
+        ("fixes", "t_s,x_m,y_m\n", "1,2"),
+        ("truth", "t_s,x_m,y_m,theta_rad\n", "1,2,0"),
+    ],
+)
+def test_a_table_in_milliseconds_is_refused_with_both_spans_and_its_unit(
+    tmp_path, table, header, row
+):
+    odometry = rows_in(1, SPEED_HEAD, "1,0", 60)
+    milli, whole = (rows_in(unit, header, row, 60) for unit in (1000, 1))
+    only(data_set(tmp_path / "s", odometry=odometry, **{table: whole}))
+    with pytest.raises(DatasetError) as refused:
+        only(data_set(tmp_path / "ms", odometry=odometry, **{table: milli}))
+    said = str(refused.value)
+    assert said.startswith(f"r1/{table}.csv, ")
+    assert "0.000 to 59000.000 s, are not those of the odometry, 0.000 to 59.000 s, 59 of" in said
+    assert "1,000 times as long, as times in milliseconds are; to convert from millisec" in said
+
+
+def test_detections_that_outlast_the_odometry_are_dropped_unless_they_are_nearly_all(tmp_path):
+    def read_until(seconds: int, **tables: str) -> RobotStream:
+        seen = rows_in(1, SEEN_HEAD, "7,2.5,0.5", seconds)
+        odometry = rows_in(1, SPEED_HEAD, "1,0", 10)
+        return only(data_set(tmp_path, odometry=odometry, observations=seen, **tables))
+
+    assert len(read_until(90).landmark_detections.ids) == 10
+    with pytest.raises(DatasetError, match="191 of 201 rows outside; all tables of a team have"):
+        read_until(201)
+    truth = rows_in(1, "t_s,x_m,y_m,theta_rad\n", "1,2,0", 201)
+    assert len(read_until(90, truth=truth).truth) == 201
+
+
 def test_fixes_are_read_within_the_odometry_and_keep_their_bits(tmp_path):
     text = FIXES + "-1,9,9,,,\n3,5,6,,,\n7,9,9,,,\n"
     stream = only(data_set(tmp_path / "a", odometry=SPEEDS, fixes=text))
