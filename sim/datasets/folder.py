@@ -14,7 +14,13 @@ from teamslam.sim.datasets.csv_table import (
     read_table,
 )
 from teamslam.sim.datasets.detections_table import detections_of, merge_detections
-from teamslam.sim.datasets.folder_files import DETECTIONS, name_table, open_folder, unused_files
+from teamslam.sim.datasets.folder_files import (
+    DETECTIONS,
+    name_table,
+    open_folder,
+    stray_tables,
+    unused_files,
+)
 from teamslam.sim.datasets.folder_odometry import intervals_of
 from teamslam.sim.datasets.tables import DatasetError, File
 from teamslam.sim.world.config import FolderWorld
@@ -96,7 +102,8 @@ def _stream(
     kinds = ("odometry", "observations", "sightings", "fixes", "truth", "start")
     tables = {kind: _table(place, kind, robot) for kind in kinds}
     unnamed = detections_of(place, robot, classes)
-    return stream_of(robot, tables, tuple(clocks), clocks[robot], unnamed)
+    stray = stray_tables(place, TABLES)
+    return stream_of(robot, tables, tuple(clocks), clocks[robot], unnamed, stray)
 
 
 def stream_of(
@@ -105,8 +112,12 @@ def stream_of(
     team: tuple[str, ...],
     offset_ns: int = 0,
     unnamed: Detections | None = None,
+    stray: Sequence[str] = (),
 ) -> RobotStream:
-    """Measurements of a robot's tables by kind; offset_ns: of the odometry's clock."""
+    """Measurements of a robot's tables by kind.
+
+    offset_ns: of the odometry's clock. stray: files beside the tables that are not read.
+    """
     observed, sighted = tables.get("observations"), tables.get("sightings")
     if all(each is None for each in (tables.get("odometry"), observed, sighted, unnamed)):
         raise DatasetError(f"robot {robot}: neither odometry nor observations in its tables")
@@ -115,7 +126,7 @@ def stream_of(
         raise DatasetError(
             f"{robot}/odometry.csv: no odometry interval of {robot}, and without one it can not be "
             "in the map: add the table (for a robot that stands still, rows of speed 0 at its "
-            f"first and last time), or remove the folder {robot}"
+            f"first and last time), or remove the folder {robot}{_renaming(stray, 'odometry')}"
         )
     driven = int(intervals.end_ns[0] - intervals.duration_ns[0]), int(intervals.end_ns[-1])
     seen, empty_ns, more = rows.measurements_of(observed, "measurement", None, driven)
@@ -127,7 +138,8 @@ def stream_of(
             raise DatasetError(f"{table.name}, column t_s: {problem}")
         unnamed = unnamed.within(*driven)
     if not len(seen.stamps_ns) and unnamed is None:
-        notes.append("no observations: only its odometry is given")
+        hint = _renaming(stray, "observations") if observed is None else ""
+        notes.append(f"no observations: only its odometry is given{hint}")
     teammates, _, more = rows.measurements_of(sighted, "sighting", (robot, team), driven)
     notes += more
     fixes_ns, fixes, more = rows.fixes_of(tables.get("fixes"), driven)
@@ -153,6 +165,10 @@ def stream_of(
         fixes=fixes,
         clock_offset_ns=offset_ns,
     )
+
+
+def _renaming(stray: Sequence[str], kind: str) -> str:
+    return f"; if {' or '.join(stray)} has them, rename it to {kind}.csv" if stray else ""
 
 
 def _table(place: File, kind: str, robot: str) -> CsvTable | None:

@@ -99,16 +99,18 @@ def name_table(place: File, file: File, robot: str) -> str:
     return f"{robot}/{file.name}" if place.name == robot else file.name
 
 
+def stray_tables(place: File, tables: Collection[str]) -> list[str]:
+    """Names of CSV files in a folder that are no table of these kinds."""
+    known = {f"{each}.csv" for each in (*tables, "detections", "labels")}
+    names = (each.name for each in place.iterdir())
+    return sorted(each for each in names if each.lower().endswith(".csv") and each not in known)
+
+
 def unused_files(root: File, folders: Mapping[str, File], tables: Collection[str]) -> list[str]:
     """Describe CSV files and folders that are not read."""
-    known = {*tables, "detections", "labels"}
     notes = []
     for place in dict.fromkeys([root, *folders.values()]):
-        strays = sorted(
-            each.name
-            for each in place.iterdir()
-            if each.name.endswith(".csv") and each.name.removesuffix(".csv") not in known
-        )
+        strays = stray_tables(place, tables)
         if strays:
             inside = f"{place.name}: " if place != root else ""
             notes.append(

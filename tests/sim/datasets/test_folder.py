@@ -373,6 +373,17 @@ def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path):
     assert said.startswith("bob: no files in")
 
 
+def test_a_table_of_another_name_is_named_where_it_may_be_missing(tmp_path):
+    path = data_set(tmp_path, odometry=SPEEDS, observation=SEEN)
+    (path / "r1" / "FIXES.CSV").write_text(FIXES)
+    said = "if FIXES.CSV or observation.csv has them, rename it to observations.csv"
+    assert f"no observations: only its odometry is given; {said}" in only(path).notes
+    data_set(path, observations=SEEN, odom=SPEEDS)
+    (path / "r1" / "odometry.csv").unlink()
+    with pytest.raises(DatasetError, match=r"or odom\.csv has them, rename it to odometry"):
+        only(path)
+
+
 def test_launch_says_which_models_it_takes_and_what_is_wrong(tmp_path):
     data_set(tmp_path, odometry=SPEEDS, observations=SEEN + "x,1,1,1\n")
     result = run("launch", "--dataset", tmp_path)
