@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from statistics import median_low
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from teamslam.sim.world.streams import Detections, RobotStream, WorldStreams
 from teamslam.team.config import RobotConfig
 from teamslam.team.shapes import Int64
 
+SAME_PACE = 0.1  # greatest relative difference of usual odometry intervals in one unit
 TABLES = {
     "odometry": (
         "t_s", "duration_s", *rows.SPEEDS, *rows.POSES, *rows.INCREMENTS, *rows.STEERED,
@@ -72,6 +74,7 @@ def folder(
         streams = [_stream(name, folders[name], clocks, classes) for name in clocks]
         surveyed = _table(root, "landmarks", "")
         unused = unused_files(root, folders, TABLES)
+    _check_units(streams)
     if world.duration_s is not None:
         end_ns = min(each.start_ns for each in streams) + round(world.duration_s * 1e9)
         streams = [each.until(end_ns) for each in streams]
@@ -86,6 +89,9 @@ def folder(
             f"{', '.join(steered)}: wheel speed and steering can not be used: give "
             'kind = "ackermann" and wheel_base in [defaults.motion] of scenario.toml'
         )
+    others = [name for name in folders if name not in clocks]
+    if others:
+        notes.append(f"{', '.join(others)}: not in the scenario's team: left out")
     notes += unused
     return WorldStreams(
         streams=tuple(streams),
@@ -104,6 +110,38 @@ def _stream(
     unnamed = detections_of(place, robot, classes)
     stray = stray_tables(place, TABLES)
     return stream_of(robot, tables, tuple(clocks), clocks[robot], unnamed, stray)
+
+
+def _check_units(streams: Sequence[RobotStream]) -> None:
+    """Refuse robots whose stamps are in another unit than those of the others.
+
+    Both their span and their usual odometry interval differ by the ratio of two units. Honest
+    robots may drive for different times or have odometry at different rates, but not both alike.
+    """
+    spans, paces = {}, {}
+    for each in streams:
+        driven = each.intervals
+        begin_ns = driven.end_ns[0] - driven.duration_ns[0]
+        spans[each.robot] = 1e-9 * float(driven.end_ns[-1] - begin_ns)
+        paces[each.robot] = float(np.median(driven.duration_ns))
+    found = {}
+    for robot in spans:
+        others = [other for other in spans if other != robot]
+        if not others:
+            return
+        usual_s, pace = (median_low(of[other] for other in others) for of in (spans, paces))
+        unit = rows.unit_of(spans[robot] / usual_s) if usual_s > 0.0 else None
+        if unit is not None and abs(paces[robot] / (pace * unit[2]) - 1.0) < SAME_PACE:
+            found[robot] = unit, usual_s
+    if found:
+        (name, scale, _), usual_s = next(iter(found.values()))
+        one = next(iter(found))
+        span, its = ("spans", "its") if len(found) == 1 else ("span", "their")
+        table = CsvTable(f"{one}/odometry.csv", {}, [])
+        raise DatasetError(
+            f"{', '.join(found)} {span} {spans[one]:,.0f} s, the others {usual_s:,.0f} s, with as "
+            f"many rows: are {its} stamps in {name}? Then {table.conversion('t_s', name, scale)}"
+        )
 
 
 def stream_of(

@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -161,7 +162,9 @@ class DataSetRun:
     """All messages of a team on a data set; raises DatasetError, ScenarioError."""
 
     def __init__(self, path: Path) -> None:
-        streams, scenario, _ = open_data_set(path)
+        streams, scenario, missing = open_data_set(path)
+        if missing is not None:
+            streams = replace(streams, notes=(missing, *streams.notes))
         self.path = path
         self._samples = list(run_team(scenario, streams))
 

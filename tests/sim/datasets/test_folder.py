@@ -9,12 +9,21 @@ from teamslam.sim.datasets.folder_writer import write_folder
 from teamslam.sim.datasets.kinds import kind_of
 from teamslam.sim.datasets.tables import DatasetError
 from teamslam.sim.publisher.source import Source
+from teamslam.sim.recorded.world import DataSetRun
 from teamslam.sim.scenarios.scenario import Scenario, ScenarioError, load, with_options
-from teamslam.sim.scenarios.source import scenario_beside, streams_of, with_present_robots
+from teamslam.sim.scenarios.source import (
+    open_data_set,
+    scenario_beside,
+    streams_of,
+    with_present_robots,
+)
 from teamslam.sim.world.config import FolderWorld
 from teamslam.sim.world.streams import FIXES as FIXES_KIND, RobotStream, StartPose, WorldStreams
 from teamslam.team.config import RobotConfig
+from teamslam.team.wire import messages as m
 from teamslam.team.wire.arrays import floats
+from teamslam.team.wire.channels import END
+from teamslam.team.wire.codec import decoded
 from tests import teams
 from tests.commands import run
 
@@ -310,6 +319,32 @@ def test_a_table_in_milliseconds_is_refused_with_both_spans_and_its_unit(
     assert "1,000 times as long, as times in milliseconds are; to convert from millisec" in said
 
 
+def test_a_robot_in_milliseconds_is_refused_and_one_that_drives_longer_or_slower_is_not(tmp_path):
+    def team(*odometry: str) -> WorldStreams:
+        for k, text in enumerate(odometry, 1):
+            (tmp_path / f"r{k}").mkdir(exist_ok=True)
+            (tmp_path / f"r{k}" / "odometry.csv").write_text(text)
+        return read(tmp_path, *(f"r{k}" for k in range(1, len(odometry) + 1)))
+
+    def odometry(count: int, step_ms: int, unit_ms: int = 1000) -> str:
+        return SPEED_HEAD + "".join(f"{k * step_ms / unit_ms},1,0\n" for k in range(count))
+
+    usual, milli = odometry(200, 50), odometry(180, 50, 1)
+    with pytest.raises(DatasetError) as refused:
+        team(usual, usual, milli)
+    said = str(refused.value)
+    assert "r3 spans 8,950 s, the others 10 s, with as many rows" in said
+    assert (
+        "are its stamps in milliseconds? Then to convert from milliseconds, add a column map"
+        in said
+    )
+    with pytest.raises(DatasetError, match="r2, r3 span 8,950 s, the others 10 s"):
+        team(usual, milli, milli)
+    long, slow = odometry(200_000, 50), odometry(2, 50_000)
+    assert len(team(usual, usual, long).streams) == 3
+    assert len(team(usual, usual, slow).streams) == 3
+
+
 def test_detections_that_outlast_the_odometry_are_dropped_unless_they_are_nearly_all(tmp_path):
     def read_until(seconds: int, **tables: str) -> RobotStream:
         seen = rows_in(1, SEEN_HEAD, "7,2.5,0.5", seconds)
@@ -371,6 +406,19 @@ def test_a_robot_without_a_folder_is_left_out_and_named(tmp_path):
     kept, said = with_present_robots(scenario)
     assert [robot.id for robot in kept.robots] == ["alice"]
     assert said.startswith("bob: no files in")
+
+
+def test_robots_left_out_are_noted_on_both_sides(tmp_path):
+    two_robots(tmp_path)
+    own = tmp_path / "scenario.toml"
+    ids = "".join(f'[[robots]]\nid = "{name}"\n' for name in ("alice", "carol"))
+    own.write_text(f'base = "recorded"\n[world]\npath = "."\n{ids}')
+    streams, _, missing = open_data_set(tmp_path)
+    assert missing == f"carol: no files in {tmp_path.name}; the team is alice"
+    assert "bob: not in the scenario's team: left out" in streams.notes
+    (end,) = DataSetRun(tmp_path).samples([END])
+    notes = decoded(end.payload, m.End).notes
+    assert notes[: 1 + len(streams.notes)] == (missing, *streams.notes)
 
 
 def test_a_table_of_another_name_is_named_where_it_may_be_missing(tmp_path):
