@@ -111,8 +111,9 @@ def launch(
             output = output or _new_folder(dataset.stem or "bag")
             dataset = import_into(dataset, output / (dataset.stem or "bag"))
     name = scenario or ("thesis" if dataset is None else opt.scenario_for(dataset))
+    listed = opt.scenario_of(name)
     resolved = with_options(
-        opt.scenario_of(name),
+        listed,
         robots=robots if pieces is None else pieces,
         seed=seed,
         estimator=estimator,
@@ -129,7 +130,7 @@ def launch(
     opt.check_joins(resolved, opt.saved_maps(map_))
     if pieces is not None:
         opt.check_pieces(resolved)
-    resolved, missing, streams = _checked_world(resolved)
+    resolved, missing, streams = _checked_world(resolved, listed)
     if name == ASSUMED_NAME and dataset is not None and streams is not None:
         click.echo(_how_to_learn(dataset, streams), err=True)
     if resolved.is_live and listen == opt.ANY_PORT:
@@ -246,14 +247,16 @@ def _keep_showing(url: str, log: Path) -> None:
         stop.wait()
 
 
-def _checked_world(scenario: Scenario) -> "tuple[Scenario, list[str], WorldStreams | None]":
+def _checked_world(
+    scenario: Scenario, listed: Scenario
+) -> "tuple[Scenario, list[str], WorldStreams | None]":
     from teamslam.sim.world.config import LiveWorld, SimulatedWorld
 
     if isinstance(scenario.world, SimulatedWorld | LiveWorld):
         return scenario, [], None
     from teamslam.sim.scenarios.source import streams_of, with_present_robots
 
-    present, missing = with_present_robots(scenario)
+    present, missing = with_present_robots(scenario, listed)
     return present, [missing] if missing else [], streams_of(present)
 
 

@@ -98,12 +98,19 @@ def open_data_set(path: str | Path) -> tuple[WorldStreams, Scenario, str | None]
     if own == "utias":
         with open_files(str(path), UTIAS_MARKER) as files:
             robots = max(ROBOTS, *present_robots(files))
-    scenario, missing = with_present_robots(with_options(load(own), robots=robots, dataset=path))
+    listed = load(own)
+    scenario = with_options(listed, robots=robots, dataset=path)
+    scenario, missing = with_present_robots(scenario, listed)
     return streams_of(scenario), scenario, missing
 
 
-def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
-    """Remove robots without files, with a note; all stay if none has files."""
+def with_present_robots(
+    scenario: Scenario, listed: Scenario | None = None
+) -> tuple[Scenario, str | None]:
+    """Remove robots without files, with a note; all stay if none has files.
+
+    listed: as it was before `with_options`, which chooses from the robots of a folder.
+    """
     world = scenario.world
     if not isinstance(world, FolderWorld | UtiasWorld) or not world.path:
         return scenario, None
@@ -114,6 +121,9 @@ def with_present_robots(scenario: Scenario) -> tuple[Scenario, str | None]:
             present = {f"r{number}" for number in present_robots(files)}
     remaining = tuple(robot for robot in scenario.robots if robot.id in present)
     missing = [robot.id for robot in scenario.robots if robot.id not in present]
+    if isinstance(world, FolderWorld) and listed is not None:
+        names = [robot.id for robot in listed.robots]
+        missing = [name for name in names if name not in present] if present & {*names} else []
     if not remaining or not missing:
         return scenario, None
     named = (name for name in world.unknown_starts if name.removeprefix("!") not in missing)
