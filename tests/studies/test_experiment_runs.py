@@ -118,11 +118,10 @@ def test_an_outcome_that_asks_for_a_run_only_after_another_is_refused(tmp_path):
 
 
 def test_a_result_of_another_program_does_not_count(tmp_path, monkeypatch):
-    for _ in range(3):  # joblib goes on without a result that it cannot store
-        (done,) = Cases(tmp_path).run([counted(1.0)], 1)
-        assert done.result == {"rmse": 1.0}
-        if Cases(tmp_path).found(counted(1.0)) is not None:
-            break
+    list(Cases(tmp_path / "before").run([counted(1.0)], 1))  # its worker may compute the next one
+    assert Cases(tmp_path).found(counted(1.0)) is None
+    (done,) = Cases(tmp_path).run([counted(1.0)], 1)
+    assert done.result == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(1.0)) == {"rmse": 1.0}
     assert Cases(tmp_path).found(counted(2.0)) is None
     monkeypatch.setattr(

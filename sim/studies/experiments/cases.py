@@ -19,7 +19,6 @@ from teamslam.sim.studies.experiments.catalogue import Study
 from teamslam.sim.studies.experiments.experiment import Task
 
 FOLDER = "cases"
-_STORED = "output.pkl"
 IDLE_S = 5  # timeout [s] of an idle worker
 Cached = Callable[..., dict[str, Any]]
 
@@ -39,12 +38,9 @@ class Cases:
 
     def __init__(self, folder: Path) -> None:
         self._cached = Memory(folder / FOLDER, verbose=0).cache(_result, ignore=["local"])
-        self._has_any = any((folder / FOLDER).rglob(_STORED))
 
     def found(self, task: Task) -> dict[str, Any] | None:
         """Stored result of a case, or None."""
-        if not self._has_any:
-            return None
         arguments = _arguments(task)
         if not self._cached.check_call_in_cache(**arguments):
             return None
